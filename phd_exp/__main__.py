@@ -17,6 +17,7 @@ NOBODY_READS = 128 + 13  # the exit status that a shell reports for a programme 
 def main(arguments: list[str] | None = None) -> int:
     """Run the verb that the arguments name; returns the exit status."""
     status = 0
+    sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115 - closed; print() would take standard output
     try:
         status = _run(list(sys.argv[1:] if arguments is None else arguments))
         print(end="", flush=True)

@@ -1,6 +1,5 @@
 """From a checked configuration to its parts: the network and the source of samples, without Lightning."""
 
-import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -20,6 +19,9 @@ from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.errors import ConfigError, RunError, gist, in_user_code, install
 from phd_exp.records.own_images import DetectionFolder
 from phd_exp.records.runs import RunFolder
+
+CONSTANTS = ("mu_z0", "D", "z_centre", "constant_f")
+LEAST_CONSTANT = 1e-9  # the shortest distance over the longest focal length, m/px; the largest is its inverse
 
 
 def build_source(data: DataConfig) -> Source:
@@ -101,9 +103,10 @@ def recorded_constants(folder: RunFolder) -> tuple[DepthScale, float]:
         raise RunError(f"{file}: missing, so that the depth scale of its data is unknown; train the run again")
     values = folder.constants()
     try:
-        constant_f = float(values["constant_f"])
-        if not 0 < constant_f < math.inf:
-            raise ValueError(f"constant_f must be positive and finite, but is {constant_f}")
-        return DepthScale(*(float(values[name]) for name in ("mu_z0", "D", "z_centre"))), constant_f
+        *scale, constant_f = (float(values[name]) for name in CONSTANTS)
+        for name, value in zip(CONSTANTS, (*scale, constant_f), strict=True):
+            if not LEAST_CONSTANT <= value <= 1 / LEAST_CONSTANT:
+                raise ValueError(f"{name} must be {LEAST_CONSTANT} to {1 / LEAST_CONSTANT:g}, but is {value}")
+        return DepthScale(*scale), constant_f
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise RunError(f"{file}: not the constants of a run ({error})") from None

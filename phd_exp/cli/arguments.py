@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeVar
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 from phd_exp.records.detections import Detection
-from phd_exp.records.errors import ConfigError, DatasetError, RunError, complaint, listed, unknown
+from phd_exp.records.errors import ConfigError, DatasetError, RunError, complaint, listed, one_line, unknown
+from phd_exp.records.processes import announce
 from phd_exp.records.recordings import Detections
 
 if TYPE_CHECKING:  # imports of seconds, which follow the checks of the arguments
@@ -126,7 +127,7 @@ def loaded(arguments: RunArguments, device: str = "auto", coverage: Coverage = N
     trust = trusted(arguments.trust)
     predictor = load(arguments.run, device, trust=trust, views=int(arguments.views), margin=arguments.margin)
     if predictor.state != "finished":
-        print(f"note: {arguments.run[0]}: the run is {predictor.state}; its last checkpoint is used", file=sys.stderr)
+        announce(f"note: {arguments.run[0]}: the run is {predictor.state}; its last checkpoint is used")
     guarantees = coverage is not None
     if arguments.calibration:
         return predictor.calibrated(arguments.calibration, guarantees=guarantees)
@@ -234,7 +235,7 @@ def _found(detector: "Detector", images: Detections) -> Iterator[list[Detection]
     if len(empty) == len(images):
         raise DatasetError(f"{listed(empty)}: {detector.name} finds nothing; expected a box in at least one image")
     if empty:
-        print(f"note: {detector.name} finds nothing in {len(empty)} image(s): {listed(empty)}", file=sys.stderr)
+        announce(f"note: {detector.name} finds nothing in {len(empty)} image(s): {listed(empty)}")
 
 
 def with_bar(items: Iterable[Item], words: str, total: int | None) -> Iterable[Item]:
@@ -242,6 +243,7 @@ def with_bar(items: Iterable[Item], words: str, total: int | None) -> Iterable[I
     if not sys.stderr.isatty():
         return items
     from rich.console import Console
+    from rich.markup import escape
     from rich.progress import track
 
-    return track(items, words, total, console=Console(stderr=True), transient=True)
+    return track(items, escape(one_line(words)), total, console=Console(stderr=True), transient=True)

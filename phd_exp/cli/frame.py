@@ -3,15 +3,15 @@
 import os
 import re
 import signal
-import sys
 import threading
 import traceback
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import NamedTuple
 
-from phd_exp.records.errors import UNPRINTABLE, ConfigError, UserError, in_user_code, install, one_line
+from phd_exp.records.errors import CONTROLS, ConfigError, UserError, in_user_code, install, one_line
+from phd_exp.records.processes import announce
 
 RESUMES = "the same command resumes"
 HOME = re.compile(r"(?<=[=,'\"\[])~[\w.-]*(?=[/,'\"\]]|$)")
@@ -72,7 +72,7 @@ def run_verb(main: Callable[[list[str]], int], words: list[str]) -> int:
     """Run a verb with the words of its command line; returns the exit status."""
     try:
         words = [HOME.sub(lambda found: os.path.expanduser(found[0]), word) for word in words]
-        for word in filter(UNPRINTABLE.search, words):
+        for word in filter(CONTROLS.search, words):
             raise ConfigError(f"{one_line(word)}: holds control characters; expected printable KEY=VALUE")
         with stopping_on_signals():
             return main(words)
@@ -87,7 +87,7 @@ def run_verb(main: Callable[[list[str]], int], words: list[str]) -> int:
 def print_errors(lines: Iterable[str]) -> None:
     """Print errors to standard error."""
     for line in lines:
-        print(f"error: {line}", file=sys.stderr)
+        announce(f"error: {line}")
 
 
 @contextmanager
@@ -98,6 +98,8 @@ def stopping_on_signals() -> Iterator[None]:
     """
 
     def stop(signum: int, frame: FrameType | None) -> None:
+        with suppress(OSError):  # standard error may be closed; print() may be at work
+            os.write(2, f"{signal.Signals(signum).name} received: stopping\n".encode())
         raise Stopped(signum)
 
     before = {signum: signal.signal(signum, stop) for signum in (signal.SIGINT, signal.SIGTERM)}

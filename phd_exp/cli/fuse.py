@@ -2,7 +2,6 @@
 
 import json
 import math
-import sys
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -17,6 +16,7 @@ from phd_exp.records.errors import ConfigError, RunError, listed
 from phd_exp.records.files import write_atomic
 from phd_exp.records.messages import MessageFile
 from phd_exp.records.own_images import Observed, annotations, detections_in, observed
+from phd_exp.records.processes import announce
 from phd_exp.records.recordings import MCAP, is_recording
 
 if TYPE_CHECKING:  # imports of seconds, which follow the checks of the arguments
@@ -48,8 +48,8 @@ class FuseArguments(RunArguments):
     @classmethod
     def a_plane(cls, plane: tuple[float, ...] | None) -> tuple[float, ...] | None:
         """Require finite numbers, and a normal that is not zero."""
-        if plane and not (all(map(math.isfinite, plane)) and any(plane[:3])):
-            raise ValueError("expected finite numbers, and a normal that is not zero")
+        if plane and not (all(abs(number) <= 1e9 for number in plane) and max(map(abs, plane[:3])) >= 1e-9):
+            raise ValueError("expected finite numbers up to 1e9, and a normal that is not zero")
         return plane
 
     @model_validator(mode="after")
@@ -88,11 +88,11 @@ def main(words: list[str]) -> int:
     else:
         write_atomic(out, text)
     if out is not None:
-        print(f"{out}: {len(answers)} scenes", file=sys.stderr)
+        announce(f"{out}: {len(answers)} scenes")
     failed = [str(answer["scene"]) for answer in answers if answer["status"] != "fused"]
     if failed:
         count = f"{len(failed)} of {len(answers)} scenes have no fused position"
-        print(f"error: {count}: {listed(failed)}; the line of each says why", file=sys.stderr)
+        announce(f"error: {count}: {listed(failed)}; the line of each says why")
     return 1 if failed else 0
 
 

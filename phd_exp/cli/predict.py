@@ -1,7 +1,6 @@
 """`python -m phd_exp predict`: positions of objects in images with their uncertainty, as JSON lines."""
 
 import json
-import sys
 from collections.abc import Iterable
 from importlib.util import find_spec
 from itertools import chain, islice
@@ -17,6 +16,7 @@ from phd_exp.records.detections import Detection, detections_of, named_apart
 from phd_exp.records.errors import ConfigError, RunError, UserError, writing
 from phd_exp.records.foreign import boxes_in
 from phd_exp.records.own_images import detections_in, images_in
+from phd_exp.records.processes import announce
 from phd_exp.records.recordings import MCAP, Detections, Recording, is_recording
 from phd_exp.records.written import Written
 
@@ -145,7 +145,7 @@ def _write(
             line = answer(sighting, predictor.temperature) | {"picture": name}
             lines.write(json.dumps(line, allow_nan=False) + "\n")
             written.write(name, picture(sighting, line, curve, guarantee))
-    print(f"{out / LINES}, and a picture for each line", file=sys.stderr)
+    announce(f"{out / LINES}, and a picture for each line")
 
 
 def _picture(number: int, n: int, detection: Detection) -> str:

@@ -28,6 +28,10 @@ if TYPE_CHECKING:  # optional
     import optuna
 
 
+SEQUENCES = ("GridSampler", "QMCSampler")
+"""Samplers whose seed determines the values of all trials; that of the others is increased with each trial."""
+
+
 class SearchArguments(Arguments):
     """The keys of a search; all others are overrides of its runs."""
 
@@ -42,7 +46,7 @@ class Space(BaseModel):
 
     model_config = ConfigDict(extra="forbid")
 
-    space: dict[str, str]
+    space: dict[str, Any]
     overrides: list[str] = Field(default_factory=list)
     sampler: TrainingTarget = {"_target_": "optuna.samplers.TPESampler", "seed": 0}
     pruner: TrainingTarget = {"_target_": "optuna.pruners.MedianPruner"}
@@ -75,7 +79,7 @@ def main(words: list[str]) -> int:
     return 0
 
 
-def distributions(space: Mapping[str, str]) -> dict[str, Any]:
+def distributions(space: Mapping[str, Any]) -> dict[str, Any]:
     """Optuna's distributions of values in Hydra's grammar of sweeps: choice(...), range(...), interval(...).
 
     `int(interval(...))` is of whole numbers; `tag(log, interval(...))` searches the logarithm.
@@ -99,7 +103,7 @@ def distributions(space: Mapping[str, str]) -> dict[str, Any]:
                 places = [int(place) for place in override.sweep_string_iterator()]
                 found[key] = IntDistribution(places[0], places[-1], step=int(value.step))
             else:
-                raise ValueError("expected choice(...), range(...) or interval(...)")
+                raise ValueError("expected choice(A,B), range(FIRST,END) or interval(LOW,HIGH)")
         except (HydraException, ValueError, TypeError, IndexError) as error:
             raise ConfigError(f"space.{key}: got {text!r}; {gist(error)}") from None
     return found
@@ -120,10 +124,7 @@ class _Search:
             pruner=build(space.pruner),
             load_if_exists=True,
         )
-        sampler = dict(space.sampler)
-        if "seed" in sampler:  # a resumed search would draw the values of its first trials again
-            sampler["seed"] += len(self.study.trials)
-        self.study.sampler = build(sampler)
+        self.sampler = space.sampler
         asked = {"space": space.space, "overrides": fixed}
         if self.study.user_attrs.get("asked", asked) != asked:
             raise RunError(
@@ -138,7 +139,7 @@ class _Search:
         running = self.study.get_trials(deepcopy=False, states=[optuna.trial.TrialState.RUNNING])
         begun = [optuna.trial.Trial(self.study, trial._trial_id) for trial in running]
         while begun or len(self.study.trials) < trials:
-            trial = begun.pop() if begun else self.study.ask(self.space)
+            trial = begun.pop() if begun else self._ask()
             self._run_trial(trial, trials)
             self._write()
         search = self._write()
@@ -148,6 +149,14 @@ class _Search:
         words = " ".join(f"{key}={value}" for key, value in best.overrides.items())
         score = f"{search.objective} {best.value:.4g}"
         print(f"{self.folder}: best of {len(self.study.trials)} trials: {words}: {score}, {best.run}")
+
+    def _ask(self) -> "optuna.Trial":
+        """The next trial; its values follow from those of the trials before, also in a resumed search."""
+        sampler, number = dict(self.sampler), len(self.study.trials)
+        if isinstance(sampler.get("seed"), int) and not sampler["_target_"].endswith(SEQUENCES):
+            sampler["seed"] += number
+        self.study.sampler = build(sampler)
+        return self.study.ask(self.space)
 
     def _run_trial(self, trial: "optuna.Trial", trials: int) -> None:
         import optuna

@@ -2,7 +2,6 @@
 
 import json
 import math
-import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
@@ -18,6 +17,7 @@ from phd_exp.records.errors import ConfigError, UserError, writing
 from phd_exp.records.foreign import boxes_of_images
 from phd_exp.records.messages import optical_frame
 from phd_exp.records.own_images import detections_in, tracks_of
+from phd_exp.records.processes import announce
 from phd_exp.records.recordings import MCAP, is_recording
 from phd_exp.records.videos import length_of, require_av, shots_in
 from phd_exp.records.written import Written
@@ -157,7 +157,7 @@ def _require_frames(boxes: dict[int, list[Box]], length: int | None, stride: int
     """Raise ConfigError if no box is in a frame that is used; a length may be unknown, or an estimate."""
     first, last = min(boxes), max(boxes)
     if first == 1 and last >= (length or 0):
-        print(f"note: boxes: got image_id 1 to {last}; expected numbers of frames from 0", file=sys.stderr)
+        announce(f"note: boxes: got image_id 1 to {last}; expected numbers of frames from 0")
     if not any(n % stride == 0 and n < (length or math.inf) for n in boxes):
         used = "every frame" if stride == 1 else f"frames 0, {stride}, ..."
         raise ConfigError(
@@ -209,7 +209,7 @@ def _followed(
     followed = noting(followed, lambda one: (one.frame.where, one.warnings), "frames")
     for one in with_bar(followed, f"tracking {sequence.name}", sequence.length):
         if one.reason:
-            print(f"note: {one.frame.where}: {one.reason}; {AFTER_LOSS}", file=sys.stderr)
+            announce(f"note: {one.frame.where}: {one.reason}; {AFTER_LOSS}")
         yield one
 
 
@@ -255,4 +255,4 @@ def _write(
                 for followed in path:
                     lines.write(_line(arguments, predictor, sequence, followed) + "\n")
                     video.add(followed)
-    print(f"{file}, and a video for each path", file=sys.stderr)
+    announce(f"{file}, and a video for each path")

@@ -2,6 +2,7 @@
 
 import re
 import shlex
+import sys
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 
@@ -81,20 +82,24 @@ def _unknown_key(key: str, config_name: str) -> str:
     groups = OF_VERB["render" if config_name == "render" else "train"]
     if key in groups:
         return f"{key}: a group; expected {key}=CHOICE, or {key}.KEY=VALUE"
+    is_hydra, launcher = key.startswith("hydra."), [word for word in sys.argv if word.startswith("hydra/")]
     with hydra.initialize_config_dir(str(conf_folder()), version_base="1.3"):
-        composed = hydra.compose(config_name)
-        config = OmegaConf.masked_copy(composed, [str(name) for name in composed if name not in SHARED])
+        composed = hydra.compose(config_name, launcher * is_hydra, return_hydra_config=is_hydra)
+        names = ["hydra"] if is_hydra else [str(name) for name in composed if name not in SHARED]
+        config = OmegaConf.masked_copy(composed, names)
     top = sorted({*map(str, config), *groups})
-    everything = [*top, *flatten(OmegaConf.to_container(config)), *keys]  # type: ignore[arg-type]
+    everything = [*flatten(OmegaConf.to_container(config))]  # type: ignore[arg-type]
+    everything += [] if is_hydra else [*top, *keys]
     section = key.rpartition(".")[0]
     node = OmegaConf.select(config, section) if section else None
     if not isinstance(node, DictConfig):
         return unknown(key, everything, f"expected one of {', '.join(top)}")
     valid = [str(name) for name in node if not str(name).startswith("_")]
     near = [*(f"{section}.{name}" for name in valid), *everything]
-    takes_more = section == "trainer" or "_target_" in node
+    takes_more = not is_hydra and (section == "trainer" or "_target_" in node)
     further = f"; a further argument of its class has a plus sign: +{key}=VALUE" if takes_more else ""
-    return unknown(key, near, f"expected one of {', '.join(valid)}{further}")
+    one = f"one of {', '.join(valid)}" if valid else f"a choice with keys: {section.replace('.', '/')}=CHOICE"
+    return unknown(key, near, f"expected {one}{further}")
 
 
 def _keys_of_choices() -> dict[str, list[str]]:

@@ -11,7 +11,7 @@ import pyarrow.parquet as pq
 import torch
 from torch import Tensor
 
-from phd_exp.records.errors import RunError, gist
+from phd_exp.records.errors import RunError, gist, remedy
 from phd_exp.records.files import MB, require_plain
 
 Arrays = Mapping[str, np.ndarray]
@@ -49,9 +49,9 @@ def read_table(file: Path) -> Arrays:
             table = pq.ParquetFile(stream, metadata=metadata, read_dictionary=texts).read()
             return {name: _values(name, table[name]) for name in table.column_names}
     except FileNotFoundError:
-        raise RunError(f"{file.name}: missing, though the run has finished") from None
+        raise RunError(f"{file}: missing, though the run has finished") from None
     except (pa.ArrowException, OSError, KeyError, TypeError, ValueError) as error:
-        raise RunError(f"{file.name}: cannot be read ({gist(error)})") from None
+        raise RunError(f"{file}: cannot be read ({gist(error)}){remedy(error)}") from None
 
 
 def require_columns(names: Iterable[str], table: Collection[str], what: str = "predictions") -> None:
@@ -84,9 +84,9 @@ def _require_small(file: Path, metadata: pq.FileMetaData) -> None:
     size = sum(metadata.row_group(index).total_byte_size for index in range(metadata.num_row_groups))
     values = metadata.num_rows * metadata.num_columns
     if metadata.num_rows == 0:
-        raise RunError(f"{file.name}: has no rows")
+        raise RunError(f"{file}: has no rows")
     if values > MOST_VALUES or size > LARGEST:
         raise RunError(
-            f"{file.name}: has {metadata.num_rows} rows of {metadata.num_columns} columns; expected at most "
+            f"{file}: has {metadata.num_rows} rows of {metadata.num_columns} columns; expected at most "
             f"{MOST_VALUES} values and {LARGEST / MB:.0f} MB"
         )

@@ -122,12 +122,12 @@ def read_views(file: Path) -> SeveralViews:
     """The recorded views of a run. Raises RunError if they cannot be read, or are not views of several cameras."""
     table = read_table(file)
     needed = (*NEEDED, *(MOMENTS if COVARIANCE[0] in table else parameter_names(table)))
-    require_columns(needed, table, file.name)
+    require_columns(needed, table, str(file))
     flat = {name: torch.from_numpy(table[name]) for name in needed}
     rows = torch.arange(len(flat["view"]), dtype=torch.float64)
     views = int(flat["view"].max()) + 1
     if views < 2 or len(rows) % views or not bool((flat["scene"] * views + flat["view"] == rows).all()):
-        raise RunError(f"{file.name}: not every view of every scene, two or more, in order; {AGAIN}")
+        raise RunError(f"{file}: not every view of every scene, two or more, in order; {AGAIN}")
     return _finite(flat, views, file)
 
 
@@ -138,19 +138,19 @@ def read_sequences(file: Path) -> list[SeveralViews]:
     """
     table = read_table(file)
     needed = (*NEEDED, *OF_FRAMES, *parameter_names(table))
-    require_columns(needed, table, file.name)
+    require_columns(needed, table, str(file))
     flat = {name: torch.from_numpy(table[name]) for name in needed}
     images, cameras = int((flat["track"] == 0).sum()), int(flat["view"].max()) + 1
     n, rest = divmod(len(flat["track"]), max(images, 1))
     tracks, views = torch.arange(n).repeat_interleave(images), torch.arange(images).repeat(n) % cameras
     in_order = not rest and torch.equal(flat["track"], tracks.double()) and torch.equal(flat["view"], views.double())
     if images < 2 * cameras or images % cameras or not in_order:
-        raise RunError(f"{file.name}: not sequences of equal length, two frames or more, in order; {AGAIN}")
+        raise RunError(f"{file}: not sequences of equal length, two frames or more, in order; {AGAIN}")
     found = _finite(flat, images, file)
     each = [{name: values[:, camera::cameras] for name, values in found.columns.items()} for camera in range(cameras)]
     time = each[0]["time"]
     if not bool((time.diff() > 0).all()) or any(not torch.equal(one["time"], time) for one in each):
-        raise RunError(f"{file.name}: the times of a sequence do not increase; {AGAIN}")
+        raise RunError(f"{file}: the times of a sequence do not increase; {AGAIN}")
     return [SeveralViews(columns, found.left_out) for columns in each]
 
 
@@ -159,10 +159,10 @@ def _finite(flat: Mapping[str, Tensor], views: int, file: Path) -> SeveralViews:
     columns = {name: column.reshape(-1, views) for name, column in flat.items()}
     finite = torch.stack(list(columns.values())).isfinite().all(0).all(-1)
     if not bool(finite.any()):
-        raise RunError(f"{file.name}: of no scene all predictions are finite; train longer")
+        raise RunError(f"{file}: of no scene all predictions are finite; train longer")
     found = SeveralViews(columns).subset(finite)
     try:
         _ = found.world_moments
     except ValueError as error:
-        raise RunError(f"{file.name}: no predictions with poses ({gist(error)}); {AGAIN}") from None
+        raise RunError(f"{file}: no predictions with poses ({gist(error)}); {AGAIN}") from None
     return found

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -28,6 +27,7 @@ from phd_exp.models.regressor import Regressor
 from phd_exp.optics.lens import PINHOLE, Lens
 from phd_exp.optics.virtual import Box, VirtualCamera, enlarged, intrinsics
 from phd_exp.records.errors import ConfigError, DatasetError, RunError, listed
+from phd_exp.records.processes import announce
 from phd_exp.records.runs import CHOOSE, RunFolder
 
 if TYPE_CHECKING:  # imports of pyarrow
@@ -305,11 +305,14 @@ class Predictor:
         """The measure of `familiar`; None if it has no, or too few, recorded predictions of held-out samples."""
         if not self.is_probabilistic:
             return None
-        from phd_exp.evaluation.familiar import Familiarity
+        from phd_exp.evaluation.familiar import FEWEST, Familiarity
 
-        with suppress(RunError):
+        try:
             return Familiarity(self.held_out(), self.temperature)
-        return None
+        except RunError as error:
+            if self.state == "finished" and self.config.data.n_held_out >= 2 * FEWEST:
+                announce(f"note: no `familiar`: {error}")
+            return None
 
     def familiar(
         self, raw: Float[Tensor, "batch *members n"], f: Float[Tensor, " batch"], prediction: Prediction | None = None

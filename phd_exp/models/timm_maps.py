@@ -1,7 +1,9 @@
 """Feature maps of the networks of timm, with weights that were trained on photographs."""
 
 import fnmatch
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, nullcontext
+from urllib.request import urlopen
 
 import numpy as np
 import torch
@@ -11,7 +13,9 @@ from torch.nn.modules.batchnorm import _BatchNorm
 
 from phd_exp.models.backbones import reading_weights
 from phd_exp.models.regressor import IMAGENET_MEAN, IMAGENET_STD
-from phd_exp.records.errors import unknown
+from phd_exp.records.errors import gist, unknown
+
+WAIT = 10.0  # seconds for the first answer of a server
 
 
 class TimmMaps(nn.Module):
@@ -59,9 +63,10 @@ class TimmMaps(nn.Module):
             raise ValueError(
                 unknown(name, timm.list_models(), "expected one of timm.list_models()", "unknown network")
             )
-        self.network = timm.create_model(
-            name, pretrained=pretrained is True, features_only=True, out_indices=tuple(out_indices)
-        )
+        with _downloading(name) if pretrained is True else nullcontext():
+            self.network = timm.create_model(
+                name, pretrained=pretrained is True, features_only=True, out_indices=tuple(out_indices)
+            )
         if isinstance(pretrained, str):
             with reading_weights(pretrained):
                 missing = self.network.load_state_dict(load_state_dict(pretrained), strict=False).missing_keys
@@ -89,6 +94,24 @@ class TimmMaps(nn.Module):
     def forward(self, pixels: Float[Tensor, "batch 3 height width"]) -> list[Float[Tensor, "batch _ _ _"]]:
         maps: list[Tensor] = self.network(pixels * self.scale + self.shift)
         return maps
+
+
+@contextmanager
+def _downloading(name: str) -> Iterator[None]:
+    """Convert the errors of downloading a network's weights to a ValueError, at once if there is no internet."""
+    import timm
+    from huggingface_hub import constants, try_to_load_from_cache
+
+    try:
+        # without an answer, the body would try again for a minute
+        if not try_to_load_from_cache(timm.get_pretrained_cfg(name).hf_hub_id, constants.SAFETENSORS_SINGLE_FILE):
+            urlopen(constants.ENDPOINT, timeout=WAIT).close()
+        yield
+    except OSError as error:
+        reason = gist(getattr(error, "reason", error))
+        raise ValueError(
+            f"pretrained: expected a file, backbone.network.pretrained=FILE, or internet for {name} ({reason})"
+        ) from None
 
 
 def _freeze(network: nn.Module, patterns: Sequence[str]) -> None:

@@ -8,7 +8,7 @@ from zipfile import ZIP_STORED, ZipFile
 import torch
 from torch import nn
 
-from phd_exp.records.errors import RunError
+from phd_exp.records.errors import RunError, remedy
 from phd_exp.records.files import require_plain
 
 ADVICE = "delete it to begin the run again"
@@ -30,7 +30,7 @@ def load_checkpoint(file: Path, map_location: Any = None) -> dict[str, Any]:
         raise RunError(f"{file}: holds more than tensors and plain values, which is not read; {ADVICE}") from None
     except Exception as error:  # torch raises any error on other bytes
         reason = " ".join((getattr(error, "strerror", None) or str(error).split("\n")[0]).split())[:120]
-        raise RunError(f"{file}: not a whole checkpoint ({reason}); {ADVICE}") from None
+        raise RunError(f"{file}: not a whole checkpoint ({reason}){remedy(error, ADVICE)}") from None
     if not isinstance(content, dict):
         raise RunError(f"{file}: not a checkpoint of a run; {ADVICE}")
     return content

@@ -4,6 +4,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from os import fsencode
 from os.path import commonpath
 from pathlib import Path
 from typing import Annotated, Any
@@ -220,8 +221,9 @@ def named_apart(detections: Sequence[Detection]) -> list[Detection]:
 
 
 def _names(files: Sequence[Path]) -> list[str]:
+    """The names from where folders differ; what is not UTF-8 is written as \\x.., because JSON holds only text."""
     folder = commonpath([file.absolute().parent for file in files])
-    return [file.absolute().relative_to(folder).as_posix() for file in files]
+    return [fsencode(file.absolute().relative_to(folder)).decode(errors="backslashreplace") for file in files]
 
 
 def line_of(values: Any, where: str) -> DetectionLine:

@@ -15,8 +15,8 @@ from pydantic_core import ErrorDetails
 
 LONGEST_GIST = 400  # characters of an error that a message repeats
 LONGEST_VALUE = 120  # characters of a value that a message repeats
-UNPRINTABLE = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
-"""Characters that would end the line of a message, or control the terminal."""
+CONTROLS = re.compile(r"[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]")
+"""Characters that end a line, control a terminal, or turn the direction of the text that follows."""
 _PACKAGE = Path(__file__).parents[1]
 _LIBRARIES = (str(_PACKAGE), str(_PACKAGE.parent / "hydra_plugins"), sysconfig.get_path("stdlib"), "<")
 """Beginnings of the file names of this package, the standard library, and code without a file."""
@@ -28,6 +28,7 @@ EXTRAS = {
     "rosbags": "ros",
 }  # fmt: skip
 """Optional package -> the extra of phd_exp that installs it."""
+READABLE = "make it a readable file"
 NAMED = 5  # names that a message lists
 
 
@@ -159,6 +160,12 @@ def gist(error: BaseException) -> str:
     else:
         text = str(getattr(error, "strerror", None) or error) or type(error).__name__
     return " ".join(text.split())[:LONGEST_GIST]
+
+
+def remedy(error: BaseException, otherwise: str = "") -> str:
+    """`; ` and what to do about a file that cannot be read: `otherwise` only if the system lets it be read."""
+    words = READABLE if getattr(error, "errno", None) else otherwise
+    return f"; {words}" if words else ""
 
 
 def in_user_code(error: BaseException) -> str | None:

@@ -36,11 +36,12 @@ from typing import Any, Literal
 import yaml
 from pydantic import AwareDatetime, Field, FiniteFloat, TypeAdapter, ValidationError
 
-from phd_exp.records.errors import RunError, gist, writing
+from phd_exp.records.errors import RunError, gist, remedy, writing
 from phd_exp.records.files import MB, read_jsonl, read_plain, write_atomic
 from phd_exp.records.parsing import Record, parse_json, parse_yaml
 from phd_exp.records.processes import held, machine
 
+AGAIN = "delete the folder to run again"
 LAST_EPOCH = 10**9
 HELD_OUT = "-held-out"  # of sequences of another seed, which choose the motion and the slow errors
 UNSHIFTED = "home"  # the unchanged test samples, among shifts
@@ -297,7 +298,7 @@ def _read_mapping(file: Path, parse: Any) -> dict[str, Any]:
 
 
 def _unreadable(file: Path, complaint: str, error: Exception) -> RunError:
-    return RunError(f"{file}: {complaint} ({gist(error)}); delete the folder to run again")
+    return RunError(f"{file}: {complaint} ({gist(error)}){remedy(error, AGAIN)}")
 
 
 def versions() -> dict[str, str]:

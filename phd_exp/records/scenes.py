@@ -26,6 +26,7 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Share = Annotated[float, Field(ge=0, le=1)]
 Vector = tuple[Finite, Finite, Finite]
+Place = Annotated[float, Field(ge=-1e9, le=1e9)]  # m; in larger worlds, float64 is too coarse
 Seed = Annotated[int, Field(ge=0, lt=2**31)]
 Count = Annotated[int, Field(ge=0)]
 
@@ -140,7 +141,7 @@ class Pose(Record):
     """
 
     rotation: Quaternion
-    translation: Vector
+    translation: tuple[Place, Place, Place]
 
 
 FIRST_VIEW = Pose(rotation=(1.0, 0.0, 0.0, 0.0), translation=(0.0, 0.0, 0.0))

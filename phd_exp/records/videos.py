@@ -15,6 +15,9 @@ from jaxtyping import UInt8
 from phd_exp.records.errors import ConfigError, DatasetError, gist
 from phd_exp.records.files import require_plain
 
+CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg,flv,asf,ogg,mxf"
+"""FFmpeg's names of the formats that are read: each is one file. Others, such as playlists, name further files."""
+LONGEST_WAIT = 30.0  # seconds for one packet; signals are handled between packets
 CLOCK = 90_000  # ticks a second of a written video, as in broadcasting
 FRAGMENTED = {"movflags": "frag_keyframe+empty_moov+default_base_moof"}  # what is written can be played after a kill
 KEY_FRAMES = 30  # frames from one to the next, at most
@@ -123,7 +126,8 @@ def _opened(file: Path) -> Iterator[tuple[Any, Any]]:
 
     with _reading(str(file)):
         require_plain(file)
-        container = av.open(str(file))
+        reads = {"format_whitelist": CONTAINERS, "protocol_whitelist": "file"}
+        container = av.open(f"file:{file}", options=reads, timeout=LONGEST_WAIT)
     with container:
         if not container.streams.video:
             raise DatasetError(f"{file}: has no images; expected a video")
@@ -142,7 +146,7 @@ def _reading(where: str) -> Iterator[None]:
         yield
     except (OSError, FFmpegError) as error:
         reason = f"{where}: cannot be read as a video ({gist(error)})"
-        raise DatasetError(f"{reason}; expected a whole file of MP4, MOV, MKV, WEBM, AVI or another format") from None
+        raise DatasetError(f"{reason}; expected a whole file of MP4, MOV, MKV, WEBM, AVI, OGG, TS or MPEG") from None
 
 
 class VideoWriter:

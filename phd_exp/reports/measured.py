@@ -118,7 +118,7 @@ def _tracks(folder: RunFolder) -> dict[str, TrackScores]:
     cameras = max(map(len, tested.values()))
     if not any(len(each) >= cameras for each in held_out):
         several = f" from {cameras} cameras" if cameras > 1 else ""
-        raise RunError(f"{folder.sequences.name}: no held-out sequences{several}; repeat the command of the training")
+        raise RunError(f"{folder.sequences}: no held-out sequences{several}; repeat the command of the training")
     chosen = [choose([each[:k] for each in held_out if len(each) >= k]) for k in range(1, cameras + 1)]
     return {
         frames if k == 1 else f"{frames}_{k}": track_scores(each[:k], choice)

@@ -11,9 +11,9 @@ from typing import Any, Literal
 from phd_exp.evaluation.parquet import Arrays, read_table
 from phd_exp.evaluation.point_errors import COLUMNS, Estimate, MeanErrors, mean_errors
 from phd_exp.records.choices import flatten, has_influence
-from phd_exp.records.errors import RunError, one_line
+from phd_exp.records.errors import READABLE, RunError, one_line
 from phd_exp.records.files import make_folder
-from phd_exp.records.runs import CHOOSE, SECTIONS, RunFolder, RunStatus, find_runs
+from phd_exp.records.runs import AGAIN, CHOOSE, SECTIONS, RunFolder, RunStatus, find_runs
 from phd_exp.records.searches import Search, read_searches
 from phd_exp.reports.measured import Measured, Notes, kept_or_measured, measure
 from phd_exp.reports.table import file_stem, printable
@@ -148,7 +148,7 @@ def _whole_run(run: Run, kept: Path | None, notes: Notes) -> Run:
     predictions = _table(folder.predictions, notes, needed=state == "finished")
     errors, nll = _tested(run, predictions, notes) if state == "finished" else ({}, None)
     if state == "finished" and not errors:
-        state, detail = "unreadable", f"{notes[-1]}; delete the folder to run again"
+        state, detail = "unreadable", notes[-1] + f"; {AGAIN}" * (not notes[-1].endswith(READABLE))
     held_out = _table(folder.held_out, notes)
     chosen = {name: column[CHOOSE] for name, column in (held_out or {}).items()}
     held_out_errors, held_out_nll = _errors(chosen, ("mode",), notes)

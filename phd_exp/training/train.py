@@ -1,7 +1,7 @@
 """One run from its configuration to its record: whether it may start, and in how many processes it trains."""
 
 from collections.abc import Sequence
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from functools import partial
 from typing import Any
 
@@ -56,7 +56,7 @@ def train(
     if render and not folder.is_finished():
         for data in config.rendered:
             render(data)
-    with folder.held():
+    with nullcontext() if folder.is_finished() else folder.held():  # that of a finished run may be read-only
         require_same_config(folder, config)
         if folder.is_finished():
             return folder.results()

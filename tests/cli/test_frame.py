@@ -1,11 +1,13 @@
 """How errors and the end of a parent end a job; no job runs here."""
 
 import os
+import signal
 import time
 
 import pytest
 import torch
 
+from phd_exp.__main__ import main
 from phd_exp.cli.frame import Stopped, ending_with, failure, stopping_on_signals
 
 
@@ -14,6 +16,22 @@ def test_a_job_ends_with_the_process_that_started_it() -> None:
         time.sleep(60)
     with stopping_on_signals(), ending_with(os.getppid()):
         time.sleep(0.1)
+
+
+def test_a_signal_is_acknowledged_at_once(capfd: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(Stopped), stopping_on_signals():
+        try:
+            signal.raise_signal(signal.SIGINT)
+        finally:
+            assert capfd.readouterr().err == "SIGINT received: stopping\n"
+
+
+def test_without_standard_error_nothing_else_is_printed(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sys.stderr", None)  # as with `2>&-`
+    assert main(["trian"]) == 2
+    assert capsys.readouterr().out == ""
 
 
 def test_memory_that_runs_out_is_one_line() -> None:

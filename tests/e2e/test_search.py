@@ -3,6 +3,7 @@
 import signal
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -15,7 +16,7 @@ from tests.support.recorded import status_of
 
 optuna = pytest.importorskip("optuna", reason="needs `pip install 'phd_exp[search]'`")
 
-from phd_exp.cli.search import distributions  # noqa: E402
+from phd_exp.cli.search import Space, _Search, distributions  # noqa: E402
 
 WORDS = ("space.yaml", "config_dir=my_conf", *QUICK[1:])
 SPACE = """
@@ -45,10 +46,32 @@ def test_values_are_those_of_hydras_sweeps() -> None:
     }
 
 
-@pytest.mark.parametrize("text", ["3", "interval(2, 1)", "glob(*)", "interval(0, 1", "range(3, 3)"])
-def test_other_values_are_refused(text: str) -> None:
+@pytest.mark.parametrize("text", ["3", "interval(2, 1)", "glob(*)", "interval(0, 1", "range(3, 3)", [0.5, 2]])
+def test_other_values_are_refused(text: Any) -> None:
     with pytest.raises(ConfigError, match=r"^space\.a: got "):
         distributions({"a": text})
+
+
+@pytest.mark.parametrize("sampler", ["RandomSampler", "TPESampler", "QMCSampler"])
+def test_a_resumed_search_tries_the_values_of_an_uninterrupted_one(
+    sampler: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def tell(self: _Search, trial: Any, trials: int) -> None:
+        self.study.tell(trial, trial.params["a"])
+
+    def searched(name: str, *parts: int) -> list[float]:
+        (tmp_path / name).mkdir()
+        for trials in parts:
+            found = _Search(space, [], None, tmp_path / name)
+            found.run(trials)
+        return [trial.params["a"] for trial in found.study.trials]
+
+    monkeypatch.setattr(_Search, "_run_trial", tell)
+    chosen = {"_target_": f"optuna.samplers.{sampler}", "seed": 0}
+    space = Space(space={"a": "interval(0, 1)"}, sampler=chosen, pruner={"_target_": "optuna.pruners.NopPruner"})
+    whole = searched("whole", 14)
+    assert len(set(whole)) == 14
+    assert searched("resumed", 3, 4, 12, 14) == whole
 
 
 @pytest.mark.slow

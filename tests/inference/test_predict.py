@@ -403,3 +403,13 @@ def test_a_prediction_imports_nothing_that_it_does_not_need(make: Callable[..., 
     done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert "familiar" in json.loads(done.stdout)
+
+
+def test_a_damaged_record_of_held_out_samples_is_noted(
+    make: Callable[..., RunFolder], photos: Path, phd_exp: Callable
+) -> None:
+    run = make(*NOWHERE, "data.n_held_out=40")
+    run.held_out.write_bytes(b"PAR1")
+    outcome = phd_exp("predict", f"run={run.path}", f"image={photos / '0.png'}", "f=400")
+    assert outcome.status == 0
+    assert f"note: no `familiar`: {run.held_out}: cannot be read (" in outcome.err

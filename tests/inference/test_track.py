@@ -207,6 +207,18 @@ def test_a_broken_video_is_refused(video: Path, spoil: Callable[[bytes], bytes],
         list(shots_in(video))
 
 
+@pytest.mark.parametrize(
+    "playlist",
+    ["ffconcat version 1.0\nfile other.mp4\n", "#EXTM3U\n#EXT-X-TARGETDURATION:1\n#EXTINF:1,\nother.mp4\n#EXT-X-ENDLIST\n"],
+)
+def test_a_playlist_reads_no_other_file(video: Path, playlist: str) -> None:
+    video.rename(video.with_name("other.mp4"))
+    for name in ("clip.mp4", "clip.m3u8", "clip.ffconcat"):
+        video.with_name(name).write_text(playlist)
+        with pytest.raises(DatasetError, match="cannot be read as a video"):
+            list(shots_in(video.with_name(name)))
+
+
 def test_a_video_that_ends_early_is_refused_after_its_frames(tmp_path: Path) -> None:
     av = pytest.importorskip("av")
     file = tmp_path / "clip.mkv"

@@ -1,6 +1,8 @@
 """Networks of timm: their weights, images normalised for them, and what training leaves as it is."""
 
 from pathlib import Path
+from typing import Any
+from urllib.error import URLError
 
 import pytest
 import timm
@@ -54,6 +56,16 @@ def test_training_leaves_frozen_modules_and_the_statistics_of_all_layers(weights
     assert {"map.weight", "bn1.weight", "layer2.0.bn2.weight", "layer2.0.downsample.1.weight"} <= changed
     assert not [name for name in changed if name.startswith(("conv1.", "layer1.")) or "conv2." in name]
     assert not [name for name in changed if "running" in name]
+
+
+def test_without_internet_a_file_is_asked_for_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    def offline(*_: Any, **__: Any) -> None:
+        raise URLError(OSError(-2, "Name or service not known"))
+
+    monkeypatch.setattr("phd_exp.models.timm_maps.urlopen", offline)
+    monkeypatch.setattr("huggingface_hub.try_to_load_from_cache", lambda *_: None)
+    with pytest.raises(ValueError, match=r"backbone\.network\.pretrained=FILE, .* \(Name or service not known\)"):
+        TimmMaps(TINY, True)
 
 
 def test_without_frozen_modules_all_is_trained(weights: Path) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from phd_exp.records.dataset import DatasetFolder
-from phd_exp.records.detections import Detection
+from phd_exp.records.detections import Detection, detections_of
 from phd_exp.records.errors import DatasetError, UserError
 from phd_exp.records.own_images import DetectionFolder, fingerprint
 
@@ -33,6 +33,11 @@ def read(folder: DetectionFolder) -> Callable[..., list[Detection]]:
         return folder.detections("train", n)
 
     return read
+
+
+def test_a_name_that_is_not_utf8_is_written_in_text() -> None:
+    (detection,) = detections_of([Path(os.fsdecode(b"b\xff.png"))], {"f": 900.0})
+    assert detection.line.file_name == "b\\xff.png"
 
 
 def test_what_is_left_out_follows_from_the_image(read: Callable) -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from phd_exp.records.processes import Child, held, one_core
+from phd_exp.records.processes import Child, announce, held, one_core
 
 
 def test_shared_locks_are_compatible_and_exclude_an_exclusive_one(
@@ -25,6 +25,11 @@ def test_a_lock_that_is_a_link_is_refused(tmp_path: Path) -> None:
     with pytest.raises(OSError, match="symbolic links"), held(tmp_path / "lock"):
         pass
     assert not (tmp_path / "diary").exists()
+
+
+def test_a_line_controls_no_terminal(capfd: pytest.CaptureFixture[str]) -> None:
+    announce("a\x1b[2Jb\u202ec\x9bd\ne\u2066f\udcffg 中")
+    assert capfd.readouterr().err == "a?[2Jb?c?d e?f?g 中\n"
 
 
 CHILD = """
