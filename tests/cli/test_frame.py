@@ -2,6 +2,7 @@
 
 import os
 import signal
+import sys
 import time
 
 import pytest
@@ -31,6 +32,7 @@ def test_without_standard_error_nothing_else_is_printed(
 ) -> None:
     monkeypatch.setattr("sys.stderr", None)  # as with `2>&-`
     assert main(["trian"]) == 2
+    sys.stderr.close()
     assert capsys.readouterr().out == ""
 
 

@@ -209,7 +209,10 @@ def test_a_broken_video_is_refused(video: Path, spoil: Callable[[bytes], bytes],
 
 @pytest.mark.parametrize(
     "playlist",
-    ["ffconcat version 1.0\nfile other.mp4\n", "#EXTM3U\n#EXT-X-TARGETDURATION:1\n#EXTINF:1,\nother.mp4\n#EXT-X-ENDLIST\n"],
+    [
+        "ffconcat version 1.0\nfile other.mp4\n",
+        "#EXTM3U\n#EXT-X-TARGETDURATION:1\n#EXTINF:1,\nother.mp4\n#EXT-X-ENDLIST\n",
+    ],
 )
 def test_a_playlist_reads_no_other_file(video: Path, playlist: str) -> None:
     video.rename(video.with_name("other.mp4"))
