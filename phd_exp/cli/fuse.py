@@ -1,7 +1,6 @@
 """`python -m phd_exp fuse`: one position of each scene from several cameras, or from one camera and a known plane."""
 
 import json
-import math
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path

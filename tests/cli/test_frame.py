@@ -21,10 +21,8 @@ def test_a_job_ends_with_the_process_that_started_it() -> None:
 
 def test_a_signal_is_acknowledged_at_once(capfd: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(Stopped), stopping_on_signals():
-        try:
-            signal.raise_signal(signal.SIGINT)
-        finally:
-            assert capfd.readouterr().err == "SIGINT received: stopping\n"
+        signal.raise_signal(signal.SIGINT)
+    assert capfd.readouterr().err == "SIGINT received: stopping\n"
 
 
 def test_without_standard_error_nothing_else_is_printed(
