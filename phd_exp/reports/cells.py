@@ -9,7 +9,6 @@ from scipy import stats
 
 from phd_exp.evaluation.point_errors import ErrorKey, SampleMean, difference
 from phd_exp.metrics.bootstrap import Interval
-from phd_exp.records.errors import one_line
 from phd_exp.reports.paper import PUBLISHED, bound_mm
 from phd_exp.reports.runs import Report, Run
 from phd_exp.reports.table import bounds
@@ -141,4 +140,4 @@ def _reason(run: Run | None, key: ErrorKey) -> str:
         return "no eight views: repeat its command with evaluation.eight_views=true"
     if run.state == "finished":
         return "no sample: none of its test samples lies in the central half"
-    return f"{run.state}: {one_line(run.detail)}" if run.detail else run.state
+    return f"{run.state}: {run.detail}" if run.detail else run.state

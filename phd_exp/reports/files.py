@@ -118,7 +118,7 @@ def tidy(numbers: Sequence[Mapping[str, Any]]) -> str:
     stream = io.StringIO()
     writer = csv.DictWriter(stream, list(numbers[0]) if numbers else [], lineterminator="\n")
     writer.writeheader()
-    writer.writerows(numbers)
+    writer.writerows({key: one_line(v) if isinstance(v, str) else v for key, v in line.items()} for line in numbers)
     return stream.getvalue()
 
 
@@ -156,7 +156,7 @@ def markdown(table: Table) -> str:
 
 def _plain(text: str) -> str:
     """Text without a meaning in Markdown."""
-    return SPECIAL.sub(r"\\\1", text)
+    return SPECIAL.sub(r"\\\1", one_line(text))
 
 
 def _markdown_line(row: TableRow) -> str:
@@ -211,7 +211,7 @@ def latex(table: Table) -> str:
 
 def _escaped(text: str) -> str:
     """Text without a meaning in LaTeX; letters beyond ASCII, which a font may lack, by their numbers."""
-    return "".join(SYMBOLS.get(letter) or (letter if letter.isascii() else f"U+{ord(letter):04X}") for letter in text)
+    return "".join(SYMBOLS.get(one) or (one if one.isascii() else f"U+{ord(one):04X}") for one in one_line(text))
 
 
 def _latex_group(rows: Sequence[TableRow], below: str) -> str:

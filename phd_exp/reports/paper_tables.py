@@ -76,7 +76,7 @@ def _table(report: Report, preset: str, layout: Layout, begun: Begun, reading: R
     return Table(
         stem=file_stem(layout.name, preset, reading),
         kind="tables",
-        title=f"The paper's {layout.title}, {one_line(in_words(preset))}: {IN_WORDS[reading]}{_samples(cells)}",
+        title=f"The paper's {layout.title}, {in_words(preset)}: {IN_WORDS[reading]}{_samples(cells)}",
         stub=("model", "error (mm)") if is_by_line else ("model",),
         columns=tuple(data if is_by_line else (f"{quantity} error (mm)" for quantity in DIGITS)),
         groups=(*groups, tuple(_bound_rows(layout, data, is_by_line))),

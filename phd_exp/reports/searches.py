@@ -1,6 +1,5 @@
 """Searches: a table of the best trials of each."""
 
-from phd_exp.records.errors import one_line
 from phd_exp.records.searches import Search, Trial
 from phd_exp.reports.runs import Report
 from phd_exp.reports.table import Table, TableCell, TableRow, file_stem, printable
@@ -28,10 +27,10 @@ def _table(search: Search) -> Table:
     return Table(
         stem=file_stem("search", search.name),
         kind="searches",
-        title=one_line(f"Search {search.name}: {counts}"),
+        title=f"Search {search.name}: {counts}",
         stub=("trial", "overrides"),
-        columns=(one_line(search.objective),),
-        groups=(tuple(TableRow((str(one.number + 1), one_line(_words(one))), (cells[id(one)],)) for one in best),),
+        columns=(search.objective,),
+        groups=(tuple(TableRow((str(one.number + 1), _words(one)), (cells[id(one)],)) for one in best),),
         notes=(OF_A_SEARCH,),
         cells=tuple(cells.values()),
     )

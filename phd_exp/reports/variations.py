@@ -10,7 +10,6 @@ from statistics import fmean
 
 from phd_exp.evaluation.point_errors import ErrorKey
 from phd_exp.records.choices import in_words
-from phd_exp.records.errors import one_line
 from phd_exp.reports.runs import Report, Run
 from phd_exp.reports.table import NOTHING, Table, TableCell, TableRow, file_stem
 
@@ -55,7 +54,7 @@ def _table(choice: tuple[str, str, str], found: Mapping[str | None, Variation]) 
     return Table(
         stem=file_stem("variations", preset, data, model),
         kind="variations",
-        title=one_line(f"Variations of {in_words(preset)}: {model} on {data}, held-out images"),
+        title=f"Variations of {in_words(preset)}: {model} on {data}, held-out images",
         stub=("overrides", "seeds"),
         columns=("NLL (nats)", "projected (mm)", "depth (mm)", "difference"),
         groups=(
@@ -73,7 +72,7 @@ def _order(variation: Variation) -> float:
 
 def _row(overrides: str, variation: Variation, difference: TableCell) -> TableRow:
     cells = (_mean(overrides, variation, quantity) for quantity in DIGITS)
-    return TableRow((one_line(overrides or "none"), ", ".join(map(str, sorted(variation)))), (*cells, difference))
+    return TableRow((overrides or "none", ", ".join(map(str, sorted(variation)))), (*cells, difference))
 
 
 def _mean(overrides: str, variation: Variation, quantity: str) -> TableCell:

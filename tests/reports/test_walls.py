@@ -14,6 +14,7 @@ from phd_exp.records.runs import RunFolder, find_runs
 from phd_exp.reports import ensembles, paper_figures, runs
 from phd_exp.reports.measured import Measured
 from phd_exp.reports.runs import Run
+from tests.support.recorded import only_run, status_of
 from tests.support.synthetic import write_run
 
 
@@ -34,6 +35,7 @@ def shown(phd_exp: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     """Reports `runs/`, unmeasured, and requires the good run and a page for all; returns standard error."""
     monkeypatch.setattr(runs, "measure", lambda *arguments: Measured())
     write_run(tmp_path / "runs", "default", n=20, epochs=2)
+    status_of(only_run(tmp_path / "runs"), machine="\x1b[2J", git_commit="\u202e")
 
     def report() -> str:
         outcome = phd_exp("report")
@@ -41,7 +43,8 @@ def shown(phd_exp: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
         assert "small/default/probabilistic/seed0" in outcome.out
         assert ",default,probabilistic,0," in (tmp_path / "report/tables/runs.csv").read_text()
         assert 'class="note error"' not in page("default")
-        assert "\x1b" not in outcome.out + outcome.err
+        tables = [file.read_text() for file in (tmp_path / "report/tables").iterdir()]
+        assert not {"\x1b", "\u202e"} & set("".join([outcome.out, outcome.err, *tables]))
         overview = (tmp_path / "report/site/index.html").read_text()
         for folder in find_runs(tmp_path / "runs"):
             assert f'href="runs/small-{folder.path.parts[-3]}-probabilistic-seed0.html"' in overview
