@@ -18,7 +18,7 @@ from phd_exp.metrics.ordered import Ordered, in_order_of
 SEED = 1
 _SHARES = torch.tensor([0.5, 0.025, 0.975], dtype=torch.float64)
 _AT_ONCE = 200_000  # samples simulated at a time
-_DRAWS, _FEWEST_DRAWS = 400_000, 200
+_DRAWS, _FEWEST_DRAWS = 100_000, 200
 """Positions drawn from all predictions, and at least from each."""
 REFERENCED = (
     *("depth_ence", "projected_ence", "inside_90", "miscalibration_area", "depth_pit_area", "depth_pit_ks"),
