@@ -112,7 +112,7 @@ def stopping_on_signals() -> Iterator[None]:
 
 @contextmanager
 def ending_with(parent: int | None) -> Iterator[None]:
-    """Send SIGTERM to this process if its parent ends during the body; None disables this.
+    """Send SIGTERM to this process if its parent ends during the body, and end it after the body; None disables this.
 
     A killed launcher cannot stop its workers: those of joblib would run all jobs that they have been given.
     """
@@ -123,10 +123,12 @@ def ending_with(parent: int | None) -> Iterator[None]:
             if over.wait(1.0):
                 return
         os.kill(os.getpid(), signal.SIGTERM)
+        over.wait()
+        os._exit(128 + signal.SIGTERM)  # a worker would wait for further jobs
 
-    if parent is not None:
-        threading.Thread(target=watch, daemon=True).start()
     try:
+        if parent is not None:
+            threading.Thread(target=watch, daemon=True).start()
         yield
     finally:
         over.set()

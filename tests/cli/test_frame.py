@@ -2,6 +2,7 @@
 
 import os
 import signal
+import subprocess
 import sys
 import time
 
@@ -11,10 +12,21 @@ import torch
 from phd_exp.__main__ import main
 from phd_exp.cli.frame import Stopped, ending_with, failure, stopping_on_signals
 
-
-def test_a_job_ends_with_the_process_that_started_it() -> None:
-    with pytest.raises(Stopped, match="SIGTERM"), stopping_on_signals(), ending_with(parent=-1):  # no parent of ours
+WORKER = """
+import time
+from phd_exp.cli.frame import Stopped, ending_with, stopping_on_signals
+try:
+    with stopping_on_signals(), ending_with(parent=-1):  # no parent of ours
         time.sleep(60)
+except Stopped as stop:
+    print(stop, flush=True)
+    time.sleep(60)  # for further jobs
+"""
+
+
+def test_a_job_and_its_worker_end_with_the_process_that_started_them() -> None:
+    done = subprocess.run([sys.executable, "-c", WORKER], capture_output=True, text=True, timeout=50, check=False)
+    assert done.returncode == 128 + signal.SIGTERM
     with stopping_on_signals(), ending_with(os.getppid()):
         time.sleep(0.1)
 
