@@ -6,7 +6,7 @@ import os
 import warnings
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -158,7 +158,7 @@ def kept_or_measured(
     measured = measuring()
     with suppress(OSError):  # then the next report measures again
         if beginning(file)[:8] in (b"", b'{"key": '):  # otherwise another program's
-            write_atomic(file, json.dumps({"key": key, "measured": asdict(measured)}))
+            write_atomic(file, json.dumps({"key": key, "measured": _ADAPTER.dump_python(measured)}))
     return measured
 
 

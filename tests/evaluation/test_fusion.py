@@ -220,6 +220,6 @@ ORDER = "not every view of every scene, two or more, in order"
     ],
 )
 def test_a_bad_record_is_one_line(calibrated: Path, tmp_path: Path, change: "object", message: str) -> None:
-    with pytest.raises(RunError, match=f"^changed: {message}") as caught:
+    with pytest.raises(RunError, match=f"^{tmp_path / 'changed'}: {message}") as caught:
         read_views(changed(calibrated, tmp_path / "changed", change))
     assert "\n" not in str(caught.value)

@@ -1,7 +1,7 @@
 """Writes the site of all runs, each file atomically: an interrupted report leaves pages that open."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -36,7 +36,7 @@ def write_site(report: Report, tables: Sequence[Table], figures: Sequence[str], 
         several = len(report.runs) > 1
         drawn = [_write_run(written, run, several) for run in report.runs]
         groups = overview_groups(drawn, report.searches)
-        charts = {key: asdict(chart) for group, _ in groups.values() for key, chart in group.items()}
+        charts = {key: vars(chart) for group, _ in groups.values() for key, chart in group.items()}
         written.write("data/overview.js", as_script("overview", {"charts": charts}))
         written.write("compare.html", comparison_page(report.runs))
         written.write("index.html", overview_page([one.run for one in drawn], tables, groups, figures))

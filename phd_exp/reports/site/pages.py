@@ -118,7 +118,7 @@ def run_script(drawn: Drawn) -> str:
             for name, values in (before.resampled if before else {}).items()
         },
         "scene": scene_traces(run.measured.scene) if run.measured.scene else None,
-        "charts": {key: asdict(chart) for charts in drawn.charts.values() for key, chart in charts.items()},
+        "charts": {key: vars(chart) for charts in drawn.charts.values() for key, chart in charts.items()},
     }  # fmt: skip
     return as_script(run.slug, content)
 
@@ -132,8 +132,10 @@ def as_script(name: str, content: Any) -> str:
         >>> as_script("a", {"x": [1.5, float("nan")]})
         'phdExp.receive("a", {"x":[1.5,null]});\\n'
     """
-    finite = json.loads(json.dumps(content), parse_constant=lambda _: None)
-    text = f"phdExp.receive({json.dumps(name)}, {json.dumps(finite, separators=(',', ':'))});\n"
+    text = json.dumps(content, separators=(",", ":"))
+    if "NaN" in text or "Infinity" in text:
+        text = json.dumps(json.loads(text, parse_constant=lambda _: None), separators=(",", ":"))
+    text = f"phdExp.receive({json.dumps(name)}, {text});\n"
     for character in "<>&\u2028\u2029":
         text = text.replace(character, f"\\u{ord(character):04x}")
     return text
