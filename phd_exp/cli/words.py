@@ -31,6 +31,8 @@ def require_overrides(words: Sequence[str]) -> None:
         word = "".join(parts)
         if len(parts) > 1:
             raise ConfigError(f"{' '.join(parts)}: has spaces; expected {shlex.quote(word)}")
+        if re.search("[\ud800-\udfff]", word):
+            raise ConfigError(f"{word}: is not UTF-8, as the record of a run is; rename the file or folder")
         if "=" not in word and not word.startswith("~"):
             choices = [f"{group}={name}" for group in OF_VERB["train"] for name in choices_of(group)]
             expected = f"a verb ({', '.join(VERBS)}) is the first word; {GRAMMAR}"

@@ -19,7 +19,7 @@ from pydantic import ValidationError
 
 from phd_exp.records.cameras import Calibration, calibration_in, read_camera
 from phd_exp.records.detections import Detection, RecordedImage, line_of
-from phd_exp.records.errors import CONTROLS, DatasetError, UserError, gist, listed, one_line, shown
+from phd_exp.records.errors import DatasetError, UserError, gist, listed, one_line, shown
 from phd_exp.records.files import require_plain
 from phd_exp.records.images import FORMATS, decoding, pillow_warnings
 from phd_exp.records.messages import COMPRESSED, INFO, RAW, SECOND, require_rosbags, typestore
@@ -75,7 +75,7 @@ class Recording:
         """
         require_rosbags("folder")
         with _opened(path) as reader:
-            found = [one for one in reader.connections if one.msgcount and not CONTROLS.search(one.topic)]
+            found = [one for one in reader.connections if one.msgcount]
             counts = {(one.topic, _kind(one)): one.msgcount for one in found}
         topics = dict(counts.keys())
         name, _, given = (topic or "").partition(",")
