@@ -52,6 +52,7 @@ def test_other_values_are_refused(text: Any) -> None:
         distributions({"a": text})
 
 
+@pytest.mark.filterwarnings("ignore::optuna.exceptions.ExperimentalWarning")
 @pytest.mark.parametrize("sampler", ["RandomSampler", "TPESampler", "QMCSampler"])
 def test_a_resumed_search_tries_the_values_of_an_uninterrupted_one(
     sampler: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
