@@ -17,7 +17,7 @@ from pathlib import Path
 from phd_exp.records.cameras import Calibration, read_camera
 from phd_exp.records.dataset import sha256
 from phd_exp.records.detections import Detection, line_of
-from phd_exp.records.errors import DatasetError, gist, listed, shown
+from phd_exp.records.errors import CONTROLS, DatasetError, gist, listed, shown
 from phd_exp.records.files import checksum, read_jsonl
 from phd_exp.records.foreign import Entry, expected_in, format_of
 from phd_exp.records.images import SUFFIXES
@@ -173,6 +173,8 @@ def tracks_of(detections: Sequence[Detection]) -> dict[int | str | None, list[De
 def _inside(folder: Path, name: str, where: str, key: str = "file_name") -> Path:
     """The file; a stranger's data set must not read files outside its folder."""
     try:
+        if CONTROLS.search(name):
+            raise ValueError("control characters")
         leaves = Path(name).is_absolute() or ".." in Path(name).parts
         leaves = leaves or not (folder / name).resolve().is_relative_to(folder.resolve())
     except (ValueError, OSError, RuntimeError) as error:  # also a link to itself, or too long a name

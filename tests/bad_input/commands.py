@@ -92,7 +92,7 @@ CONFIGURATIONS = [
     configured("a shift that is no file name", "+evaluation.shifts={a/b:{f_factor:2}}", r"evaluation\.shifts\.a/b\.\[key\]: got 'a/b'.*"),
     configured("a shift to an empty range", "+evaluation.shifts.a.data.z_range=[5,4]", r"evaluation\.shifts\.a\.data: z_range: got \[5, 4\].*"),
     configured("a shift of no data set", "+evaluation.shifts.a.data.depth=5", r"evaluation\.shifts\.a\.data: depth: got 5.*"),
-    configured("a name that is not UTF-8", "runs=r\udcff", r"runs=r\?: is not UTF-8, as the record of a run is; rename the file or folder"),
+    configured("a name that is not UTF-8", "runs=r\udcff", r"runs='r\?': is not UTF-8, as the record of a run is; rename the file or folder"),
     Bad("configuration: a zero byte", nothing, ("preset=smoke", "runs=a\0b"), r"runs=a\?b: holds control characters; .*", 2),
     *(Bad(f"configuration: {word}", nothing, ("-m", "preset=smoke", word), r"seed=range\(0,.*\): more than 10000 jobs; .*", 2) for word in ("seed=range(0,1e9)", "seed=range(0,nan)")),
     Bad("configuration: two long ranges", nothing, ("-m", "preset=smoke", "seed=range(0,9999)", "data.seed=range(0,9999)"), r"preset=smoke seed=.*: more than 10000 jobs; .*", 2),
