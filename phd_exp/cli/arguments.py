@@ -222,7 +222,7 @@ def noting(items: Iterable[Item], warned: Callable[[Item], tuple[str, Sequence[s
             found.setdefault(kind, []).append(f"{where}: {fault}")
         yield item
     for kind, faults in found.items():
-        print(f"note: {kind}: {len(faults)} of {n} {what}, first {faults[0]}", file=sys.stderr)
+        announce(f"note: {kind}: {len(faults)} of {n} {what}, first {faults[0]}")
 
 
 def _found(detector: "Detector", images: Detections) -> Iterator[list[Detection]]:
