@@ -22,7 +22,7 @@ Tolerances = Sequence[tuple[str, float, float]]
 # With AVX2 and without vectors (ATEN_CPU_CAPABILITY=default, ONEDNN_MAX_CPU_ISA=SSE41, OPENBLAS_CORETYPE=Prescott,
 # NPY_DISABLE_CPU_FEATURES), lines differ by at most 2e-7 m, or 5e-5 of other numbers; metadata and listed runs not at
 # all; the report by 4e-8, except for paths, whose motion is the optimum of a flat function of four sequences (2 %).
-# Trainings amplify the last bit, about threefold each step.
+# Trainings amplify the last bit: losses differ by 3e-6 in five steps and by 3e-4 in 20, final numbers by 9e-4.
 LINES: Tolerances = [("_mm$", 1e-4, 1e-2), ("", 1e-4, 1e-5)]
 TOLERANCES: Mapping[str, Tolerances] = {
     "configurations": (),
@@ -30,9 +30,9 @@ TOLERANCES: Mapping[str, Tolerances] = {
     "predict": LINES,
     "fuse": LINES,
     "track": LINES,
-    "graphs": LINES,
+    "graphs": [("covariance", 1e-3, 1e-5), *LINES],  # of another runtime
     "old_networks": LINES,
-    "losses": [(r"losses.json\.[0-4]$|untrained", 1e-4, 1e-5), ("losses.json", 1e-3, 1e-2), ("", 0.05, 1e-3)],
+    "losses": [(r"losses.json\.[0-4]$|untrained", 1e-5, 1e-5), ("losses.json", 1e-3, 5e-4), ("", 5e-3, 1e-3)],
     "listed": (),
     "report": [("tracks.csv", 0.1, 0.0), ("", 1e-6, 1e-9)],
 }
