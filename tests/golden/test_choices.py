@@ -29,10 +29,15 @@ STEPS = (
     "trainer.precision=float32", "evaluation.every_n_epochs=4", "optimizer.lr=1e-4",
 )  # fmt: skip
 """With steps of 1e-3, Adam would amplify the last bits of two processors to 10 % of a loss."""
-TRAININGS = ("probabilistic", "mae_vz", "mae_logz", "mae_xyz", "gaussian", "rounded_t", "probabilistic recipe=strong")
+SLOW = ("scale", "mae_vz", "mae_xyz")  # the others cover most of their code
+TRAININGS = ("probabilistic", "mae_logz", "gaussian", "rounded_t", "probabilistic recipe=strong", "mae_vz", "mae_xyz")
 
 
-@pytest.mark.parametrize("variant", RENDERS)
+def each(*names: str) -> list[Any]:
+    return [pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW)) for name in names]
+
+
+@pytest.mark.parametrize("variant", each(*RENDERS))
 def test_renders_and_their_metadata(golden: Callable, phd_exp: Callable, tmp_path: Path, variant: str) -> None:
     write_mesh(tmp_path / "part.stl", solid("cylinder"))
     outcome = phd_exp("render", f"data={variant}", *SMALL, *RENDERS[variant])
@@ -56,7 +61,7 @@ def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("model", TRAININGS)
+@pytest.mark.parametrize("model", each(*TRAININGS))
 def test_losses_of_a_training(
     golden: Callable, composed: Callable[..., Any], photographs: Path, tmp_path: Path, model: str
 ) -> None:
