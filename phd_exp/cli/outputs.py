@@ -49,13 +49,13 @@ def require_output(out: Path, name: str, arguments: Arguments, inputs: Iterable[
         start = beginning(out)
     except OSError as error:
         raise ConfigError(f"{key}={out}: {error.strerror}; expected a new file, such as {name}") from None
+    _require_unread(out, [out, _place(out).parent], arguments, inputs, key)
+    _require_outside_run(out, arguments, key, name)
     if start and not re.match(KINDS[Path(name).suffix], start, re.DOTALL):
         raise ConfigError(
             f"{key}={out}: holds other data than this command writes; expected a new file, such as {name}; move the "
             "old one away, or choose another name"
         )
-    _require_unread(out, [out, _place(out).parent], arguments, inputs, key)
-    _require_outside_run(out, arguments, key, name)
     if name.endswith(MCAP):
         require_rosbags(key)
 

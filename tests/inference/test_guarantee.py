@@ -139,7 +139,7 @@ def test_the_exported_file_has_the_threshold_and_the_energy_of_its_regions(
         run = make(*NOWHERE, "model=rounded_t")
         table = table_of(400, 1, overconfidence=1.3) | {"rounding": np.full(400, rounding)}
         pd.DataFrame(table).to_parquet(run.held_out)
-    monkeypatch.setattr(onnx, "graph", lambda predictor: models.ModelProto())
+    monkeypatch.setattr(onnx, "graph", lambda predictor: models.ModelProto(ir_version=8))
     monkeypatch.setattr(onnx, "largest_deviation", lambda *_: 0.0)
     for words in ((), ("recalibrate=true",)):
         assert phd_exp("export", f"run={run.path}", "out=network.onnx", "coverage=0.9", *words).status == 0
