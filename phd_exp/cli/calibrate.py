@@ -38,23 +38,24 @@ def main(words: list[str]) -> int:
     detections = detections_in(arguments.folder, object_name=arguments.object)
     file = RunFolder(arguments.run).labelled(arguments.name)
     require_output(file, str(file.relative_to(arguments.run)), arguments, key="name")
+    from phd_exp.data.sources import blocks
     from phd_exp.evaluation.conformal import samples_needed
     from phd_exp.inference.loading import load
     from phd_exp.inference.tables import record_labelled
 
     predictor = load(arguments.run, trust=trusted(arguments.trust), margin=arguments.margin)
     table, name = record_labelled(predictor, detections, arguments.name), arguments.name
-    temperature, n = predictor.calibrated(name).temperature, len(detections)
+    temperature = predictor.calibrated(name).temperature
+    n = len(set(blocks([one.line for one in detections]).get("block", range(len(detections)))))
     assert temperature is not None
     inside = ", ".join(f"{int((table['level'] <= level).sum())} inside {100 * level:.0f} %" for level in (0.5, 0.9))
     error = 100 * (table["depth_error_mm"] / 1000 / table["z"]).mean()
-    print(f"{file}: {n} labelled detections")
+    print(f"{file}: {len(detections)} labelled detections")
     print(f"  as trained: depth error {error:.2f} %, {inside}")
     print(f"  temperatures of a typical prediction: {temperature}")
     enough = [f"{level:g}" for level in COVERAGES if samples_needed(level) <= n // 2]
-    print(
-        f"  coverage= can guarantee {', '.join(enough) or 'nothing'}; 0.9 needs {2 * samples_needed(0.9)} detections"
-    )
+    needed = f"{2 * samples_needed(0.9)} images, tracks or scenes"
+    print(f"  coverage= can guarantee {', '.join(enough) or 'nothing'}; 0.9 needs {needed}")
     margin = f" margin={arguments.margin:g}" if arguments.margin != 1 else ""
     print(f"  use them: python -m phd_exp predict run={arguments.run} calibration={name}{margin} ...")
     return 0

@@ -6,6 +6,7 @@ from typing import TypeVar
 
 import torch
 from lightning import LightningDataModule
+from torch import Tensor
 
 from phd_exp.data.backdrops import BACKDROP_NUMBERS, Backdrops, before_others
 from phd_exp.data.batches import Augment, Batch, BatchLoader
@@ -16,7 +17,7 @@ from phd_exp.data.sources import PARTS, Part, Source
 from phd_exp.geometry.camera import Camera
 from phd_exp.records.errors import ConfigError, DatasetError
 from phd_exp.records.processes import announce
-from phd_exp.records.runs import CHOOSE
+from phd_exp.records.runs import choosing
 
 Held = TypeVar("Held", Batch, Backdrops)
 
@@ -73,7 +74,7 @@ class PositionData(LightningDataModule):
                 "shares' gradients is that of the batch only if all shares are of one size"
             )
         for part in PARTS:
-            n = len(range(source.count(part))[CHOOSE if part == "held_out" else slice(None)])
+            n = -(-source.count(part) // (2 if part == "held_out" else 1))
             if 0 < n < world:
                 raise ConfigError(f"trainer.devices: got {world}, more than the {n} samples of {part} in a pass")
         self.source = source
@@ -137,14 +138,18 @@ class PositionData(LightningDataModule):
         return self.train_batches
 
     def val_dataloader(self) -> list[BatchLoader]:
-        return [self.in_order(part, CHOOSE if part == "held_out" else slice(None)) for part in self.validated]
+        return [self.in_order(part, self._rows(part)) for part in self.validated]
+
+    def _rows(self, part: Part) -> Tensor | slice:
+        is_half = part == "held_out"
+        return torch.from_numpy(choosing(self.source.known(part)).nonzero()[0]) if is_half else slice(None)
 
     def test_dataloader(self) -> BatchLoader:
         return self.in_order("test")
 
     predict_dataloader = test_dataloader
 
-    def in_order(self, part: Part, rows: slice = slice(None)) -> BatchLoader:
+    def in_order(self, part: Part, rows: Tensor | slice = slice(None)) -> BatchLoader:
         """Every sample of a part, or of some rows, once, in the order of the data set."""
         return self.batches(self.samples[part].select(rows), shuffle=False)
 

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from phd_exp.data.batches import Batch
 from phd_exp.data.cache import cached
 from phd_exp.data.crops import cut, facing, image_size, read_image, true_position
-from phd_exp.data.sources import Known, Part, Source
+from phd_exp.data.sources import Known, Part, Source, blocks
 from phd_exp.geometry.charts import DepthScale
 from phd_exp.optics.virtual import VirtualCamera
 from phd_exp.records.dataset import sha256
@@ -80,7 +80,8 @@ class FolderSource(Source):
             "S": [self.side] * len(crops),
         }
         rendered = {name: [getattr(line, name) for line in lines] for name in KNOWN}
-        return columns | {name: values for name, values in rendered.items() if values != [None] * len(lines)}
+        columns |= {name: values for name, values in rendered.items() if values != [None] * len(lines)}
+        return columns | blocks(lines)
 
     def count(self, part: Part) -> int:
         return len(self.crops[part])

@@ -15,6 +15,7 @@ from phd_exp.data.batches import Batch
 from phd_exp.data.images import cached_clearings, cached_images
 from phd_exp.geometry.charts import DepthScale
 from phd_exp.records.dataset import DatasetFolder
+from phd_exp.records.detections import DetectionLine
 from phd_exp.records.scenes import SampleRecord, Split
 from phd_exp.records.spec import DatasetSpec
 
@@ -46,7 +47,10 @@ class Source(ABC):
 
     @abstractmethod
     def known(self, part: Part) -> Known:
-        """The columns to record with the predictions, in the order of the samples."""
+        """The columns to record with the predictions, in the order of the samples.
+
+        Dependent samples, such as the frames of a video, have the same `block`; see `records.runs.choosing`.
+        """
 
     @abstractmethod
     def count(self, part: Part) -> int:
@@ -59,6 +63,13 @@ class Source(ABC):
     def training_backdrops(self) -> Backdrops:
         """What the training images show behind their objects."""
         raise NotImplementedError
+
+
+def blocks(lines: Sequence[SampleRecord | DetectionLine]) -> Known:
+    """The column `block`, the number of the track, scene or image of each line, if two have the same; or nothing."""
+    names = [next(at for at in (line.track, line.scene, line.file_name) if at is not None) for line in lines]
+    number = {name: place for place, name in enumerate(dict.fromkeys(names))}
+    return {"block": [number[name] for name in names]} if len(number) < len(names) else {}
 
 
 class RenderedSource(Source):
@@ -117,7 +128,8 @@ class RenderedSource(Source):
     def known(self, part: Part) -> Known:
         names = ("file_name", "f", "S", "scale", "visibility", "truncation", "scene", "view")
         _, records, rows = self._records(part)
-        return {name: [getattr(record, name) for record in records[rows]] for name in names}
+        records = records[rows]
+        return {name: [getattr(record, name) for record in records] for name in names} | blocks(records)
 
     def count(self, part: Part) -> int:
         return self.n[part]

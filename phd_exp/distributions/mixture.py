@@ -15,12 +15,13 @@ from phd_exp.distributions.density import quantile_between
 from phd_exp.distributions.depth import depth_mean_energy
 from phd_exp.distributions.huber import RADIAL_NORMALISER
 from phd_exp.distributions.projected_huber import ProjectedHuber
-from phd_exp.distributions.rounded import Rounded
+from phd_exp.distributions.rounded import Rounded, depth_law
 from phd_exp.distributions.special import expint_differences
 
 DRAWS = 10_240  # for a level, whose standard error is at most 0.5 / sqrt(DRAWS) = 0.0049
 _AT_ONCE = 512  # draws in memory at a time
-_STEPS = 15  # of weighted least squares; each removes about two thirds of the error
+_STEPS = 20  # of weighted least squares; each removes about two thirds of the error
+_DEPTHS, _ANGLES, _GOLDEN = 4, 4, 0.6180339887498949  # nodes on each side of a mode and around its axis; their turn
 _PARTS, _ROUNDS = 16, 8  # an interval is divided into parts, and one of them again
 
 
@@ -101,8 +102,10 @@ class Mixture:
         """The Projected Huber distribution p with the least KL(mixture || p): that of maximum E[log p].
 
         -E[log p] is a function of A_xy, A_xy m_xy and A_xy apex, convex, plus one of (mu_z, a); each has its minimum
-        by itself. Its axis is free if the members' are. Source: own derivation; checked against a general optimiser
-        in tests/distributions/test_mixture.py.
+        by itself. Its axis is free if the members' are. The nodes leave a few thousandths of a nat where members lie
+        far apart and are wide in depth, otherwise less.
+
+        Source: own derivation; checked against a general optimiser in tests/distributions/test_mixture.py.
         """
         members = self.members
         first, first_mu_z = members.mu_xy[..., 0, :], members.mu_z[..., :1]
@@ -231,40 +234,50 @@ def _closest_projection(
 
 def _nodes(
     members: ProjectedHuber,
-) -> tuple[Float[Tensor, "*batch nodes 1"], Float[Tensor, "*batch nodes 2"], Float[Tensor, "nodes 1"]]:
-    """Depths, (x, y) and weights of the `_whitened_nodes` of all members.
+) -> tuple[Float[Tensor, "*batch nodes 1"], Float[Tensor, "*batch nodes 2"], Float[Tensor, "*batch nodes 1"]]:
+    """Depths, (x, y) and weights of the `_whitened_nodes` at the `_depth_nodes` of all members.
 
     (x, y) are relative to the axis of the first member. With a free axis, depths are relative to that of its mode.
-    This keeps the digits of narrow densities. The nodes are at the root mean square of each member's depth; with a
-    free axis, at its mean minus and plus one standard deviation.
+    This keeps the digits of narrow densities. The angles turn from each depth to the next.
     """
     nodes, weight = (torch.from_numpy(values).to(members.a) for values in _whitened_nodes())
     mu_z, mu_xy, m_xy = members.mu_z, members.mu_xy, members.m_xy
-    turned = m_xy - m_xy[..., :1, :]
+    turned = (m_xy - m_xy[..., :1, :])[..., None, :]
+    z, share = _depth_nodes(members)
     if members.k is None:
-        depths = [(members.depth_variance + members.depth_mean.square()).sqrt()]
-        axes = [depths[0][..., None] * turned]
+        z = mu_z[..., None] + z
+        axis = z[..., None] * turned
     else:
-        mean, variance = members.depth_law.excess_moments
-        width, apart = mu_z / members.a, mu_z - mu_z[..., :1]
-        beyond = [width * (mean + sign * variance.sqrt()) for sign in (-1, 1)]  # the mode
+        apart = mu_z - mu_z[..., :1]
         at_mode = mu_z[..., None] * (mu_xy - mu_xy[..., :1, :])
         at_mode = at_mode + apart[..., None] * members.apex[..., :1, :2] / mu_z[..., :1, None]
-        depths, axes = [apart + z for z in beyond], [at_mode + z[..., None] * turned for z in beyond]
+        axis = at_mode[..., None, :] + z[..., None] * turned
+        z = apart[..., None] + z
     spread = spd.inverse(members.A, members.log_det_A) * mu_z[..., None, None]
-    across = spd.matvec(spread[..., None, :, :], nodes)
-    xy = torch.cat([across + at[..., None, :] for at in axes], dim=-2)
-    z = torch.cat([at[..., None, None].expand_as(across[..., :1]) for at in depths], dim=-2)
-    count = len(depths) * members.batch_shape[-1]
-    return z.flatten(-3, -2), xy.flatten(-3, -2), (weight / count).repeat(count)[:, None]
+    xy = axis[..., None, :] + spd.matvec(spread[..., None, None, :, :], nodes)
+    every = share[..., None] * weight / members.batch_shape[-1]
+    z = z[..., None].expand_as(every)
+    return z.flatten(-3)[..., None], xy.flatten(-4, -2), every.flatten(-3)[..., None]
+
+
+def _depth_nodes(members: ProjectedHuber) -> tuple[Float[Tensor, "*batch depths"], Float[Tensor, "*batch depths"]]:
+    """Depths beyond the mode (metres) and their shares, by Laguerre's rule for a (max(t, 1/t) - 1) on each side."""
+    s, weight = (torch.from_numpy(values).to(members.a) for values in np.polynomial.laguerre.laggauss(_DEPTHS))
+    a = members.a[..., None]
+    farther = torch.log1p(s / a)
+    log_t = torch.cat([farther, -farther], dim=-1)
+    log_share = (weight.log() + s).repeat(2) - depth_law(a.log(), members.rounding).energy(log_t)
+    share = (log_share + 2 * log_t.clamp_max(0)).softmax(-1)
+    return members.mu_z[..., None] * torch.expm1(log_t), share
 
 
 def _whitened_nodes() -> tuple[np.ndarray, np.ndarray]:
-    """Gauss rules for the law of q: nodes (48, 2) on six radii, four within 1, in eight directions, and weights."""
+    """Gauss rules for the law of q on six radii, four within 1, in a few directions for each depth; and weights."""
     x, inner = np.polynomial.legendre.leggauss(4)
     s, outer = np.polynomial.laguerre.laggauss(2)
     r = np.concatenate([(x + 1) / 2, 1 + s])
     weight = r * np.concatenate([inner / 2 * np.exp(-(r[:4] ** 2) / 2), outer * np.exp(-0.5)])
-    angle = np.pi / 4 * (np.arange(8) + 0.5)
+    turn = _GOLDEN * np.arange(2 * _DEPTHS)[:, None, None]
+    angle = 2 * np.pi / _ANGLES * (np.arange(_ANGLES) + turn)  # depths, 1, angles
     nodes = r[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    return nodes.reshape(-1, 2), np.repeat(weight, 8) / (8 * RADIAL_NORMALISER)
+    return nodes.reshape(2 * _DEPTHS, -1, 2), np.repeat(weight, _ANGLES) / (_ANGLES * RADIAL_NORMALISER)

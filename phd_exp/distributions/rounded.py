@@ -30,7 +30,7 @@ from phd_exp.distributions.huber import energy_cdf
 _LEAST_LOG_A = -13.0
 _SHARE = 0.95  # of the largest exponent, up to which e^l is computed
 _LARGEST_ENERGY = 50.0
-_NODES, _PART, _LEVEL = 64, 40, 24  # nodes for the whole law, one of its tails, and each part of a level
+_NODES, _PART, _LEVEL = 64, 40, 40  # nodes for the whole law, one of its tails, and each part of a level
 _NEWTON_STEPS, _CLOSEST_STEPS = 3, 20
 Points = Float[Tensor, "*#batch points"]
 
@@ -65,6 +65,7 @@ class Rounded(DepthLaw):
         return self._mass.log() - self.log_a.clamp_min(_LEAST_LOG_A)
 
     def level(self, energy: Numbers) -> Numbers:
+        # to 1e-7 for a of at least 1e-5
         # up to the first bound, the energy that is left for the projection is beyond the knee of h
         W = energy.clamp_max(_LARGEST_ENERGY)
         bounds = self._x(self.farthest_log_t((W - 0.5).clamp_min(0))), self._x(self.farthest_log_t(W))

@@ -4,7 +4,11 @@ The score of a sample is the credible level of its true position. The threshold 
 k = ceil((n + 1) c). A further sample, exchangeable with these, lies in its region of that level with a probability
 from c to c + 1/(n + 1), for any network. Given the n samples, the coverage has the law Beta(k, n + 1 - k).
 
-Source: Vovk, Gammerman and Shafer, "Algorithmic Learning in a Random World" (2005), also for groups (Mondrian).
+Samples of one block, such as the frames of a video, are dependent, but the blocks are exchangeable. Each of n blocks
+then has the weight 1/(n + 1), shared by its samples, and a sample of a further block is covered.
+
+Source: Vovk, Gammerman and Shafer, "Algorithmic Learning in a Random World" (2005), also for groups (Mondrian); for
+blocks Lee, Barber and Willett, "Distribution-free inference with hierarchical data" (2023).
 """
 
 import math
@@ -22,13 +26,13 @@ from torch import Tensor
 from phd_exp.distributions import ProjectedHuber, Temperature
 from phd_exp.distributions.regions import Region
 from phd_exp.evaluation.parquet import Arrays, require_columns
-from phd_exp.evaluation.predictions import at_temperature
+from phd_exp.evaluation.predictions import Rows, at_temperature
 from phd_exp.evaluation.several_views import read_views
 from phd_exp.evaluation.volumes import LOG_VOLUMES
 from phd_exp.fusion import fuse
 from phd_exp.metrics.errors import squared_mahalanobis
 from phd_exp.records.errors import RunError
-from phd_exp.records.runs import CHOOSE, GUARANTEE
+from phd_exp.records.runs import choosing
 
 Groups = Literal["spread", "truncation", "focal_length"]
 GROUPED_BY: Mapping[Groups | None, Callable[[ProjectedHuber, Tensor], Tensor]] = {
@@ -45,7 +49,7 @@ PARTS = 4  # groups, of equal size among the held-out samples that may choose
 
 @dataclass(frozen=True, eq=False)
 class Guarantee:
-    """The levels of the regions with a coverage, by `n` held-out samples each, between `edges` of a quantity."""
+    """The levels of the regions with a coverage, by `n` blocks of samples each, between `edges` of a quantity."""
 
     coverage: float
     groups: Groups | None
@@ -84,23 +88,24 @@ def guarantee(
     Raises RunError, which names the origin of the samples, if there are too few, or too many positions of level 1.
     """
 
-    def scored(rows: slice) -> tuple[Float[np.ndarray, " samples"], Float[np.ndarray, " samples"]]:
-        """The levels of the true positions, and the quantities of the groups."""
+    def scored(rows: Rows) -> tuple[Float[np.ndarray, " samples"], Float[np.ndarray, " samples"], np.ndarray]:
+        """The levels of the true positions, the quantities of the groups, and the blocks."""
         p, xyz, columns = at_temperature(held_out, temperature, rows)
         require_columns(("f", "S") if groups else (), columns)
         f = torch.from_numpy(columns["f"] / columns["S"]) if groups else p.a
-        return p.level(xyz).numpy(), GROUPED_BY[groups](p, f).numpy()
+        return p.level(xyz).numpy(), GROUPED_BY[groups](p, f).numpy(), columns.get("block", np.arange(len(xyz)))
 
-    (_, chosen), (scores, values) = scored(CHOOSE), scored(GUARANTEE)
+    chooses = choosing(held_out)
+    (_, chosen, _), (scores, values, block) = scored(chooses), scored(~chooses)
     edges = np.unique(np.quantile(chosen, np.arange(1, PARTS) / PARTS))
     edges = edges[edges > chosen.min()]  # equal values are one group
     place = np.searchsorted(edges, values, side="right")
-    parts = [scores[place == group] for group in range(len(edges) + 1)]
+    parts = [(scores[place == group], block[place == group]) for group in range(len(edges) + 1)]
     samples = origin.replace(",", " of each group,") if groups else origin
-    levels = [threshold(part, coverage, samples) for part in parts]
+    levels = [threshold(part, coverage, samples, of_part) for part, of_part in parts]
     if max(levels) == 1:
         raise RunError(f"coverage: got {coverage}; too many true positions have level 1; try recalibrate=true")
-    return Guarantee(coverage, groups, edges, levels, [len(part) for part in parts])
+    return Guarantee(coverage, groups, edges, levels, [len(np.unique(of_part)) for _, of_part in parts])
 
 
 def fused_guarantee(file: Path, k: int, coverage: float, temperature: Temperature | None) -> dict[str, Any]:
@@ -114,7 +119,7 @@ def fused_guarantee(file: Path, k: int, coverage: float, temperature: Temperatur
             f"{file}: no scenes with {k} cameras, as coverage= needs; train with data=scale "
             f"evaluation.multiview.scenes=500 evaluation.multiview.views={max(k, 2)}"
         )
-    views = views.cameras(k).subset(views.columns["scene"][:, 0] % 2 == GUARANTEE.start)
+    views = views.cameras(k).subset(views.columns["scene"][:, 0] % 2 == 1)
     fused = fuse(temperature.apply(views.predictions) if temperature else views.predictions, views.pose)
     distance = squared_mahalanobis(views.truth - fused.mean, fused.covariance)
     scores = distance[distance.isfinite()].numpy()
@@ -132,7 +137,7 @@ def conformal_log_volumes(table: Arrays, held_out: Arrays, coverage: float = 0.9
     """
     require_columns(LOG_VOLUMES.values(), table)
     require_columns(("level",), held_out)
-    level = threshold(held_out["level"][GUARANTEE], coverage, "held-out samples")
+    level = level_threshold(held_out, coverage)
     ends, values = np.array(list(LOG_VOLUMES)), np.stack([table[name] for name in LOG_VOLUMES.values()])
     at, ends = (np.log(number / (1 - number)) for number in (np.clip(level, ends[0], ends[-1]), ends))
     place = min(int(np.searchsorted(ends, at, "right")), len(ends) - 1)
@@ -140,15 +145,33 @@ def conformal_log_volumes(table: Arrays, held_out: Arrays, coverage: float = 0.9
     return {"log_volume": (1 - share) * values[place - 1] + share * values[place]}
 
 
-def threshold(scores: Float[np.ndarray, " samples"], coverage: float, samples: str) -> float:
-    """The k-th smallest score. Raises RunError with the number of `samples` needed if there are fewer than k."""
+def level_threshold(held_out: Arrays, coverage: float) -> float:
+    """The `threshold` of the levels of held-out samples that guarantee; 1 where a prediction was not finite."""
+    guarantees = ~choosing(held_out)
+    block = held_out["block"][guarantees] if "block" in held_out else None
+    return threshold(np.nan_to_num(held_out["level"][guarantees], nan=1.0), coverage, "held-out samples", block)
+
+
+def threshold(
+    scores: Float[np.ndarray, " samples"], coverage: float, samples: str, block: np.ndarray | None = None
+) -> float:
+    """The k-th smallest score; of dependent samples, the least up to which the weights of n blocks reach k/(n + 1).
+
+    Raises ValueError for a score that is not a number, and RunError with the number of `samples` needed if there are
+    too few.
+    """
+    if np.isnan(scores).any():
+        raise ValueError(f"scores: got {int(np.isnan(scores).sum())} that are not numbers; expected none")
     if not 0 < coverage < 1:
         raise RunError(f"coverage: got {coverage}; expected a probability between 0 and 1, such as 0.9")
-    n, c = len(scores), Fraction(str(coverage))  # exact: 10 * 0.9 is 9
-    k = math.ceil((n + 1) * c)
-    if k > n:
+    _, place, size = np.unique(np.arange(len(scores)) if block is None else block, False, True, True)
+    n, c = len(size), Fraction(str(coverage))  # exact: 10 * 0.9 is 9
+    if math.ceil((n + 1) * c) > n:
+        samples = samples if n == len(scores) else f"blocks (track, scene or image) of {samples}"
         raise RunError(f"coverage: got {coverage}; needs at least {samples_needed(coverage)} {samples}; found {n}")
-    return float(np.partition(scores, k - 1)[k - 1])
+    order = scores.argsort()
+    weight = (1 / size[place])[order].cumsum()
+    return float(scores[order][np.searchsorted(weight, float((n + 1) * c) - 1e-9)])
 
 
 def samples_needed(coverage: float) -> int:

@@ -18,7 +18,7 @@ from phd_exp.distributions.columns import parameter_columns
 from phd_exp.evaluation.parquet import Arrays, require_columns
 from phd_exp.evaluation.predictions import at_temperature
 from phd_exp.records.errors import RunError
-from phd_exp.records.runs import CHOOSE, GUARANTEE
+from phd_exp.records.runs import choosing
 
 NEIGHBOURS = 5
 FEWEST = 20  # held-out samples that may choose
@@ -39,14 +39,15 @@ class Familiarity:
         require_columns(("f", "S"), kept)
         columns = kept | {name: column.numpy() for name, column in parameter_columns(distribution).items()}
         features = _features(columns)
-        chosen = features[CHOOSE]
+        chooses = choosing(columns)
+        chosen = features[chooses]
         if len(chosen) < FEWEST:
             raise RunError(f"familiar: needs at least {2 * FEWEST} held-out samples; found {len(features)}")
         self.middle = chosen.mean(0)
         variance, axes = np.linalg.eigh(np.cov(chosen.T))
         self.whiten = axes / np.sqrt(np.maximum(variance, _LEAST_VARIANCE))
         self.chosen = torch.from_numpy((chosen - self.middle) @ self.whiten)
-        self.usual = np.sort(self.distance(columns)[GUARANTEE])
+        self.usual = np.sort(self.distance(columns)[~chooses])
 
     def distance(self, columns: Arrays) -> Float[np.ndarray, " samples"]:
         """The score of predictions with these parameters, f and S (px); larger for less familiar ones."""

@@ -149,12 +149,15 @@ def p_value(gap: Interval[float], seeds: int) -> float:
 def significant(p_values: Mapping[Key, float], error_rate: float = 0.05) -> set[Key]:
     """The keys whose hypotheses are rejected, with a probability of `error_rate` at most that one of them is true.
 
+    Raises ValueError for a p-value that is not in [0, 1], such as NaN.
     Source: Holm, "A simple sequentially rejective multiple test procedure" (1979).
 
     Examples:
         >>> sorted(significant({"a": 0.01, "b": 0.03, "c": 0.04}))
         ['a']
     """
+    if bad := [value for value in p_values.values() if not 0 <= value <= 1]:
+        raise ValueError(f"p_values: got {bad[0]}; expected probabilities in [0, 1]")
     found: set[Key] = set()
     for place, key in enumerate(sorted(p_values, key=p_values.__getitem__)):
         if p_values[key] * (len(p_values) - place) > error_rate:

@@ -24,6 +24,7 @@ from phd_exp.metrics.strata import strata
 from phd_exp.records.errors import RunError
 
 XYZ = ("x", "y", "z")
+Rows = slice | Bool[np.ndarray, " rows"]
 ERRORS = ("projected_error_mm", "depth_error_mm")
 OF_DISTANCE = ("ale_m", "relative_error")
 OPTIONAL = (*OF_DISTANCE, "log_volume")  # younger than the first records, or measured with held-out samples
@@ -119,8 +120,8 @@ def evaluation_of(statistic: Statistic, columns: Mapping[str, Tensor], left_out:
     )
 
 
-def fit_temperature(held_out: Arrays, rows: slice = slice(None)) -> Temperature:
-    """The temperatures fitted on predictions of held-out samples: of all rows, or `CHOOSE` if the others guarantee.
+def fit_temperature(held_out: Arrays, rows: Rows = slice(None)) -> Temperature:
+    """The temperatures fitted on predictions of held-out samples: of all rows, or of those that choose.
 
     Raises RunError if a column is missing, or if no temperature fits.
     """
@@ -164,12 +165,12 @@ def ensemble_table(tables: Sequence[Arrays]) -> Arrays:
     columns = {name: torch.tensor(np.stack([table[name] for table in tables], axis=-1)) for name in parameters}
     mixture = Mixture(_distribution(columns))
     scores = distribution_columns(mixture.closest, stacked(tables[0], XYZ)) | {"disagreement": mixture.disagreement}
-    kept = {name: tables[0][name] for name in (*XYZ, "f", "S") if name in tables[0]}
+    kept = {name: tables[0][name] for name in (*XYZ, "f", "S", "block") if name in tables[0]}
     return kept | {name: column.numpy() for name, column in scores.items()}
 
 
 def at_temperature(
-    table: Arrays, temperature: Temperature | None, rows: slice = slice(None)
+    table: Arrays, temperature: Temperature | None, rows: Rows = slice(None)
 ) -> tuple[ProjectedHuber, Float[Tensor, "samples 3"], dict[str, np.ndarray]]:
     """Predictions (None: as trained), true positions (m) and all columns of the rows with finite parameters.
 
@@ -214,8 +215,8 @@ def _strata(statistic: Statistic, columns: Mapping[str, Tensor], resamples: int)
     found = []
     for quantity, (column, unit, edges) in STRATIFIED_BY.items():
         for label, mask in strata(quantity, columns[column], edges, unit).items() if column in columns else ():
-            part = {name: values[mask] for name, values in columns.items()}
-            found.append(Stratum(quantity, label, int(mask.sum()), scalar_bands(statistic, part, resamples)))
+            part, n = {name: values[mask] for name, values in columns.items()}, int(mask.sum())
+            found += [Stratum(quantity, label, n, scalar_bands(statistic, part, resamples))] if n > 1 else []
     return found
 
 

@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 
-from phd_exp.evaluation.conformal import threshold
+from phd_exp.evaluation.conformal import level_threshold
 from phd_exp.evaluation.familiar import ALARM, Familiarity
 from phd_exp.evaluation.parquet import Arrays, read_table
 from phd_exp.evaluation.predictions import ERRORS, finite_columns, inside, scalar_bands
 from phd_exp.metrics.bootstrap import Interval, means
 from phd_exp.metrics.calibration_scores import COLUMNS, calibration_scores, ordered
 from phd_exp.records.errors import RunError, one_line
-from phd_exp.records.runs import GUARANTEE, UNSHIFTED
+from phd_exp.records.runs import UNSHIFTED
 
 MEASURED = (*COLUMNS, *ERRORS, "nll")
 
@@ -46,7 +46,7 @@ def shift_scores(folder: Path, home: Arrays, held_out: Arrays | None) -> dict[st
     found, levels, rated = {}, {"50": 0.5, "90": 0.9, "99": 0.99}, _unrated
     if held_out and "level" in held_out:
         with suppress(RunError):  # too few samples
-            levels["conformal"] = threshold(held_out["level"][GUARANTEE], 0.9, "held-out samples")
+            levels["conformal"] = level_threshold(held_out, 0.9)
             familiarity = Familiarity(held_out)
             rated = partial(_rated, familiarity, np.sort(familiarity.distance(home)))
     for file in sorted(folder.glob("*.parquet")) if "level" in home else ():

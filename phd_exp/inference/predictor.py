@@ -28,7 +28,7 @@ from phd_exp.optics.lens import PINHOLE, Lens
 from phd_exp.optics.virtual import Box, VirtualCamera, enlarged, intrinsics
 from phd_exp.records.errors import ConfigError, DatasetError, RunError, listed
 from phd_exp.records.processes import announce
-from phd_exp.records.runs import CHOOSE, RunFolder
+from phd_exp.records.runs import RunFolder, choosing
 
 if TYPE_CHECKING:  # imports of pyarrow
     from phd_exp.evaluation.conformal import Groups, Guarantee
@@ -199,7 +199,7 @@ class Predictor:
     def _tempered(self, table: "Arrays", guarantees: bool) -> "Predictor":
         from phd_exp.evaluation.predictions import fit_temperature  # imports pyarrow
 
-        temperature = fit_temperature(table, CHOOSE if guarantees else slice(None))
+        temperature = fit_temperature(table, choosing(table) if guarantees else slice(None))
         return replace(self, temperature=temperature, guarantees=guarantees)
 
     def guarantee(self, coverage: float, groups: "Groups | None" = None) -> "Guarantee":

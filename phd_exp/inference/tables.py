@@ -18,7 +18,7 @@ from phd_exp.config.sections import ShiftConfig
 from phd_exp.config.targets import Trust
 from phd_exp.data.batches import Batch
 from phd_exp.data.photometry import VERSION, Photometry
-from phd_exp.data.sources import PARTS, Known, Part, RenderedSource, Source
+from phd_exp.data.sources import PARTS, Known, Part, RenderedSource, Source, blocks
 from phd_exp.distributions.columns import Columns
 from phd_exp.evaluation.parquet import read_table, stacked
 from phd_exp.evaluation.predictions import XYZ
@@ -114,7 +114,9 @@ def record_labelled(predictor: Predictor, detections: Sequence[Detection], name:
     file = folder.labelled(name)
     with folder.held():
         make_folder(file.parent)
-        write_parquet(file, found, {"file_name": [one.line.file_name for one in detections]})
+        lines = [one.line for one in detections]
+        known = {"file_name": [line.file_name for line in lines], **blocks(lines)}
+        write_parquet(file, found, known)
     return found
 
 

@@ -41,7 +41,7 @@ def bands(
     They do not test calibration: a distance from calibration cannot be negative and resampling adds noise to it, so
     close to perfect calibration all resamples may lie above the value. The interval is then extended to contain it.
 
-    Raises ValueError for no samples, or fewer than one resample.
+    Raises ValueError for fewer than two samples, whose spread is unknown, or fewer than one resample.
     Source: Efron and Tibshirani, "An introduction to the bootstrap" (1993), chapter 13.
 
     Examples:
@@ -49,6 +49,8 @@ def bands(
         >>> float(band.value), bool(band.low < band.value < band.high)
         (49.5, True)
     """
+    if len(next(iter(columns.values()), ())) < 2:
+        raise ValueError("a bootstrap needs at least two samples for an interval")
     values, drawn = resampled(statistic, columns, resamples, seed)
     return {name: interval(value, drawn[name]) for name, value in values.items()}
 

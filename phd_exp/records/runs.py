@@ -7,7 +7,7 @@
         metrics.jsonl        one line per epoch
         results.json         the final numbers
         predictions.parquet  per test sample: truth, parameters, estimate, errors
-        held_out.parquet     the same for held-out training samples; see `CHOOSE`
+        held_out.parquet     the same for held-out training samples; see `choosing`
         eight_views_*.parquet  the same two from the eight symmetric views of each image, and the views' disagreement
         views.parquet        the same for scenes with several cameras, and their poses, if asked for
         labelled/            the same for labelled images by `calibrate`, a table NAME.parquet for each
@@ -33,6 +33,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import yaml
 from pydantic import AwareDatetime, Field, FiniteFloat, TypeAdapter, ValidationError
 
@@ -51,13 +52,6 @@ LARGEST = MB  # bytes of a configuration or of a run's numbers
 PACKAGES = ("phd_exp", "torch", "torchvision", "lightning", "hydra-core", "numpy")
 """Packages on which numbers depend, whose versions are recorded."""
 
-CHOOSE, GUARANTEE = slice(0, None, 2), slice(1, None, 2)
-"""Rows of held-out samples, and scenes of several views: even ones choose, odd ones guarantee.
-
-The training uses the even rows to choose epochs, trials of a search and recipes. For guaranteed regions, even rows
-determine temperatures and borders of groups, odd rows the thresholds. Without guaranteed regions, temperatures are
-fitted to all rows.
-"""
 _NUMBERS: TypeAdapter[dict[str, int | float | None]] = TypeAdapter(dict[str, int | FiniteFloat | None])
 
 State = Literal["running", "finished", "failed", "interrupted"]
@@ -81,6 +75,18 @@ class RunStatus(Record):
     custom: dict[str, str] = Field(default_factory=dict)
     overrides: list[str] = Field(default_factory=list)
     machine: str
+
+
+def choosing(columns: Mapping[str, Any]) -> np.ndarray:
+    """Which rows of held-out samples choose; the others guarantee. Every second `block`, by default a row, chooses.
+
+    The rows of a block, such as the frames of a video, are dependent. The training uses the first rows to choose
+    epochs, trials of a search and recipes. For guaranteed regions, they determine temperatures and borders of groups,
+    the others the thresholds. Without guaranteed regions, temperatures are fitted to all rows.
+    """
+    block = columns.get("block", range(len(next(iter(columns.values())))))
+    _, first, place = np.unique(block, return_index=True, return_inverse=True)
+    return np.asarray(first.argsort().argsort()[place] % 2 == 0)
 
 
 class RunFolder:

@@ -13,7 +13,7 @@ from phd_exp.evaluation.point_errors import COLUMNS, Estimate, MeanErrors, mean_
 from phd_exp.records.choices import flatten, has_influence
 from phd_exp.records.errors import READABLE, RunError, one_line
 from phd_exp.records.files import make_folder
-from phd_exp.records.runs import AGAIN, CHOOSE, SECTIONS, RunFolder, RunStatus, find_runs
+from phd_exp.records.runs import AGAIN, SECTIONS, RunFolder, RunStatus, choosing, find_runs
 from phd_exp.records.searches import Search, read_searches
 from phd_exp.reports.measured import Measured, Notes, kept_or_measured, measure
 from phd_exp.reports.table import file_stem, printable
@@ -150,7 +150,7 @@ def _whole_run(run: Run, kept: Path | None, notes: Notes) -> Run:
     if state == "finished" and not errors:
         state, detail = "unreadable", notes[-1] + f"; {AGAIN}" * (not notes[-1].endswith(READABLE))
     held_out = _table(folder.held_out, notes)
-    chosen = {name: column[CHOOSE] for name, column in (held_out or {}).items()}
+    chosen = {name: column[choosing(held_out)] for name, column in held_out.items()} if held_out else {}
     held_out_errors, held_out_nll = _errors(chosen, ("mode",), notes)
     measuring = partial(measure, folder, config, predictions, held_out)
     stored = partial(kept_or_measured, folder, config, measuring, kept) if kept else measuring

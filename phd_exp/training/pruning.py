@@ -7,7 +7,7 @@ from warnings import catch_warnings
 from lightning import Callback, LightningModule, Trainer
 
 from phd_exp.evaluation.parquet import read_table
-from phd_exp.records.runs import CHOOSE, RunFolder
+from phd_exp.records.runs import RunFolder, choosing
 
 SCORES = ("nll", "depth_error_mm")
 """What searches and sweepers minimise: the first of them that the model has. A baseline has no likelihood."""
@@ -35,7 +35,7 @@ class Pruning(Callback):
 
 
 def held_out_score(run: Path) -> tuple[str, float]:
-    """The metric that searches and sweepers minimise, and its mean over the rows `CHOOSE`. Raises RunError."""
+    """The metric that searches and sweepers minimise, and its mean over the rows `choosing`. Raises RunError."""
     table = read_table(RunFolder(run).held_out)
     name = next(name for name in SCORES if name in table)
-    return f"held_out/{name}", float(table[name][CHOOSE].mean())
+    return f"held_out/{name}", float(table[name][choosing(table)].mean())

@@ -34,6 +34,17 @@ MIXTURES = {
     "with free axes": ensemble(1.0, 5, numbers=9),
     "apart": Mixture(ProjectedHuber.from_raw(torch.tensor(APART, dtype=torch.float64), f=F, S=S, mu_z0=MU_Z0)),
 }
+WIDE = [
+    (-16.0, -45, 70, 20, 90, 2.0, -4, 2, -1),
+    (50, -20, 120, 0, 150, 5, 6, -2, 1),
+    (20, -90, 60, 15, 120, 1, 0, 0, 2),
+]
+MIXTURES |= {
+    f"wide in depth{axes}": Mixture(
+        ProjectedHuber.from_raw(torch.tensor(WIDE)[:, :n].double(), f=F, S=S, mu_z0=MU_Z0)
+    )
+    for n, axes in ((7, ""), (9, ", with free axes"))
+}
 MIXTURES |= {
     f"{name}, rounded": Mixture(MIXTURES[name].members.with_rounding(2.0)) for name in ("with free axes", "apart")
 }
@@ -117,7 +128,9 @@ def test_no_distribution_is_closer_than_the_closest(name: str, drawn: dict[str, 
 
     def loss(raw: np.ndarray) -> tuple[float, np.ndarray]:
         leaf = torch.tensor(raw, requires_grad=True)
-        p = ProjectedHuber.from_raw(leaf, f=F, S=S, mu_z0=MU_Z0).with_rounding(mixture.members.rounding)
+        p = ProjectedHuber.from_raw(leaf, f=F, S=S, mu_z0=MU_Z0, validate_args=False).with_rounding(
+            mixture.members.rounding
+        )
         value = -p.log_prob(v).mean()
         value.backward()
         return value.item(), leaf.grad.numpy()

@@ -76,6 +76,36 @@ def test_cdf(law: Rounded, exact: Exact) -> None:
         assert law.cdf(torch.tensor(log_t, dtype=torch.float64)).item() == pytest.approx(below, rel=1e-7)
 
 
+@pytest.mark.parametrize("r", [2.0, 10.0])
+@pytest.mark.parametrize("a", [1e-5, 1e-3, 1.0, 1e6])
+def test_levels_are_exact_to_1e_7(a: float, r: float) -> None:
+    """P(h(|q|) + energy <= W) with the density r exp(-h(r)) of |q|, and with l = log t, of which both signs count."""
+    law, W = Rounded(torch.tensor(a, dtype=torch.float64).log(), r), torch.tensor([0.4, 3.0, 20.0]).double()
+    with mp.workdps(20):
+        a, r = mp.mpf(a), mp.mpf(r)
+
+        def energy(l: mp.mpf) -> mp.mpf:
+            return a * (mp.cosh(l) - 1) + mp.sqrt((a * mp.sinh(l)) ** 2 + r**2) - r
+
+        def end(w: float) -> mp.mpf:
+            return mp.acosh(1 + w * (w + 2 * r) / (2 * a * (a + r + w)))
+
+        def projected(w: mp.mpf) -> mp.mpf:
+            q = mp.sqrt(2 * w) if w <= 0.5 else w + 0.5
+            inner = 1 - mp.exp(-(min(q, 1) ** 2) / 2)
+            return inner + (mp.sqrt(mp.e) * (2 / mp.e - (1 + q) * mp.exp(-q)) if q > 1 else 0)
+
+        def integral(function, most: float, *breaks: float) -> mp.mpf:
+            ends = [0, *(end(w) for w in sorted({*breaks, *(most * share for share in (1e-3, 0.03, 0.3, 1))}))]
+            return mp.quad(lambda l: (mp.exp(l) + mp.exp(-l)) * mp.exp(-energy(l)) * function(energy(l)), ends)
+
+        mass = integral(lambda w: 1, 60, 1, 5) * (1 + mp.exp(-0.5))
+        for w, level in zip(W.tolist(), law.level(W).tolist(), strict=True):
+            knee = [w - 0.5] if w > 0.5 else []
+            expected = integral(lambda v, w=w: projected(max(w - v, mp.mpf(0))), w, *knee) / mass
+            assert abs(level - float(expected)) < 1e-7
+
+
 def test_score_is_the_integral_of_squared_differences(law: Rounded) -> None:
     a = law.log_a.exp()
     log_t = law.icdf(torch.tensor([0.02, 0.5, 0.9], dtype=torch.float64))

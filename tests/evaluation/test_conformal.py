@@ -19,7 +19,7 @@ from phd_exp.evaluation.several_views import read_views
 from phd_exp.fusion import fuse
 from phd_exp.metrics.errors import squared_mahalanobis
 from phd_exp.records.errors import RunError
-from phd_exp.records.runs import CHOOSE, GUARANTEE
+from phd_exp.records.runs import choosing
 from tests.support.several import write_views
 from tests.support.synthetic import calibrated, truths
 
@@ -64,6 +64,27 @@ def test_the_coverage_of_random_splits_has_the_exact_law(n: int, coverage: float
     assert stats.kstest(covered, stats.beta(k, n + 1 - k).cdf).pvalue > 1e-3
     error = 4 * stats.beta(k, n + 1 - k).std() / math.sqrt(SPLITS)
     assert coverage - error < covered.mean() < coverage + 1 / (n + 1) + error
+
+
+@pytest.mark.parametrize("sizes", [[20] * 25, [1, 2, 40] * 8])
+def test_a_sample_of_a_further_block_is_covered(sizes: list[int]) -> None:
+    """Nine tenths of the variance are common to a block, as in a video. The rule for single samples covers less."""
+    random, n = np.random.default_rng(0), len(sizes)
+    block = np.repeat(np.arange(n), sizes)
+    by_blocks, by_samples = [], []
+    for _ in range(SPLITS):
+        scores = 0.95 * random.standard_normal(n)[block] + 0.31 * random.standard_normal(len(block))
+        by_blocks.append(threshold(scores, 0.9, "samples", block))
+        by_samples.append(threshold(scores, 0.9, "samples"))
+    covered, less = (stats.norm.cdf(found).mean() for found in (by_blocks, by_samples))
+    assert less + 0.005 < 0.9 < covered < 0.9 + 1 / n
+    with pytest.raises(RunError, match=r"needs at least 9 blocks \(track, scene or image\) of samples; found 8"):
+        threshold(scores[block < 8], 0.9, "samples", block[block < 8])
+
+
+def test_a_score_that_is_not_a_number_is_an_error() -> None:
+    with pytest.raises(ValueError, match=r"^scores: got 1 that are not numbers"):
+        threshold(np.array([0.5] * 20 + [math.nan]), 0.9, "samples")
 
 
 @pytest.mark.parametrize("coverage", [0.5, 0.9, 0.95])
@@ -142,18 +163,24 @@ def test_a_region_is_that_of_its_group() -> None:
     assert equal.region(predictions(fresh).expand([1]), 1.0)[1]["focal_length"] == [None, None]
 
 
-def test_rows_that_choose_do_not_guarantee_and_the_others_choose_nothing() -> None:
+@pytest.mark.parametrize("blocks", [False, True])
+def test_rows_that_choose_do_not_guarantee_and_the_others_choose_nothing(blocks: bool) -> None:
     table, other = table_of(800, 1), table_of(800, 2, overconfidence=1.2)
 
-    def mixed(rows: slice) -> Table:
+    def mixed(rows: np.ndarray) -> Table:
         changed = {name: column.copy() for name, column in table.items()}
         for name in changed:
             changed[name][rows] = other[name][rows]
         return changed
 
-    chosen, guaranteed = mixed(CHOOSE), mixed(GUARANTEE)
-    temperature = fit_temperature(table, CHOOSE)
-    assert fit_temperature(guaranteed, CHOOSE) == temperature != fit_temperature(chosen, CHOOSE)
+    if blocks:
+        table["block"] = other["block"] = np.arange(800) // 20
+    rows = choosing(table)
+    assert rows.sum() == 400
+    assert (np.diff(rows) != 0).sum() == (39 if blocks else 799)
+    chosen, guaranteed = mixed(rows), mixed(~rows)
+    temperature = fit_temperature(table, rows)
+    assert fit_temperature(guaranteed, rows) == temperature != fit_temperature(chosen, rows)
     assert temperature != fit_temperature(table)
     before = guarantee(table, 0.9, "spread", None)
     np.testing.assert_array_equal(guarantee(guaranteed, 0.9, "spread", None).edges, before.edges)

@@ -15,6 +15,7 @@ from phd_exp.fusion.tracks import (
     standardised_errors,
     track,
 )
+from phd_exp.fusion.tracks.gaussian import _tilted_projection
 from phd_exp.fusion.tracks.slow import weights
 from phd_exp.metrics.errors import squared_mahalanobis
 from tests.support.paths import NO_ERRORS, Errors, around, drawn_paths
@@ -34,7 +35,24 @@ def test_one_frame_has_the_moments_of_its_density(a: float, rounding: float) -> 
     off = squared_mahalanobis(path.mean - density.mean[:, 0], density.covariance_matrix[:, 0])
     ratios = torch.linalg.eigvals(torch.linalg.solve(density.covariance_matrix[0, 0], path.covariance[0])).real
     assert off.sqrt().max() < 0.01
-    assert (ratios - 1).abs().max() < 0.02
+    assert (ratios - 1).abs().max() < 0.006
+
+
+@pytest.mark.parametrize("variance", [0.5, 5.0, 20.0, 1e3])
+@pytest.mark.parametrize("place", [0.0, 2.0, 4.0])
+def test_moments_of_a_projection_are_those_of_a_grid(place: float, variance: float) -> None:
+    """The law of q where the other frames say Normal(place, variance): mean and variances in units of their own."""
+    half = 12 * max(1.0, min(variance, 4.0) ** 0.5)
+    x, y = np.meshgrid(np.linspace(-half, half, 801) + place, np.linspace(-half, half, 801), indexing="ij")
+    squared = x * x + y * y
+    energy = np.where(squared < 1, squared / 2, np.sqrt(squared) - 0.5) + ((x - place) ** 2 + y * y) / (2 * variance)
+    weight = np.exp(-energy) / np.exp(-energy).sum()
+    mean = (weight * x).sum()
+    S = (weight * (x - mean) ** 2).sum(), (weight * y * y).sum()
+    factor = np.array([1 / S[0] - 1 / variance, 0, 1 / S[1] - 1 / variance, 0, mean / S[0] - place / variance, 0, 0])
+    _, z_x, _, Z_xx, _, Z_yy = _tilted_projection(mean, 0.0, S[0] ** 0.5, 0.0, S[1] ** 0.5, 1.0, factor)
+    assert abs(z_x) < 0.01
+    assert max(abs(Z_xx - 1), abs(Z_yy - 1)) < 0.025
 
 
 def nees(n: int, used: Slow, *, cameras: int = 1, errors: Errors = NO_ERRORS, seed: int = 0) -> tuple[float, float]:

@@ -67,7 +67,7 @@ def test_an_interval_contains_its_value_where_resampling_adds_noise() -> None:
     assert band.low == band.value < band.high
 
 
-@pytest.mark.parametrize(("n", "resamples"), [(0, 10), (5, 0)])
+@pytest.mark.parametrize(("n", "resamples"), [(0, 10), (1, 10), (5, 0)])
 def test_bad_arguments_are_refused(n: int, resamples: int) -> None:
     with pytest.raises(ValueError, match="a bootstrap needs"):
         bands(means, {"x": torch.ones(n)}, resamples, 0)
