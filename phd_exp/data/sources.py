@@ -65,7 +65,7 @@ class Source(ABC):
         raise NotImplementedError
 
 
-def blocks(lines: Sequence[SampleRecord | DetectionLine]) -> Known:
+def blocks(lines: Sequence[SampleRecord | DetectionLine]) -> dict[str, list[Any]]:
     """The column `block`, the number of the track, scene or image of each line, if two have the same; or nothing."""
     names = [next(at for at in (line.track, line.scene, line.file_name) if at is not None) for line in lines]
     number = {name: place for place, name in enumerate(dict.fromkeys(names))}
