@@ -16,9 +16,10 @@ from phd_exp.config import check
 from phd_exp.data import folder as folder_module
 from phd_exp.data.datamodule import PositionData
 from phd_exp.data.folder import FolderSource
-from phd_exp.data.sources import RenderedSource
+from phd_exp.data.sources import RenderedSource, blocks
 from phd_exp.geometry import projected
 from phd_exp.records.dataset import SPLITS, DatasetFolder
+from phd_exp.records.detections import DetectionLine
 from phd_exp.records.errors import ConfigError, DatasetError
 from phd_exp.records.own_images import DetectionFolder
 from phd_exp.records.spec import DatasetSpec
@@ -101,11 +102,26 @@ def test_constants_follow_from_the_training_detections(photos: DetectionFolder) 
 
 def test_what_is_known_is_what_the_lines_say(photos: DetectionFolder) -> None:
     own = source(photos)
-    assert own.known("train").keys() == {"file_name", "f", "S"}
+    assert own.known("train").keys() == {"file_name", "f", "S", "block"}
     known = own.known("test")
     assert known.keys() == {"file_name", "f", "S", "visibility"}
     assert (known["file_name"], known["S"], known["visibility"]) == (["tall.png"], [48], [0.5])
     assert (own.count("train"), own.count("held_out"), own.count("test")) == (3, 0, 1)
+
+
+def test_lines_of_a_track_a_scene_or_an_image_are_a_block() -> None:
+    given = [
+        ("a", 1, None),
+        ("b", 1, 7),
+        ("c", None, 7),
+        ("d", None, 7),
+        ("e", None, None),
+        ("e", None, None),
+        ("f", 0, 1),
+    ]
+    lines = [DetectionLine(file_name=file, f=500, track=track, scene=scene) for file, track, scene in given]
+    assert blocks(lines) == {"block": [0, 0, 1, 1, 2, 2, 3]}
+    assert blocks(lines[4:5]) == {}
 
 
 @pytest.mark.parametrize(("n_train", "n_held_out", "counts"), [(None, 1, (2, 1)), (1, 1, (1, 1)), (1, 2, (1, 2))])
