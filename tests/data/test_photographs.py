@@ -78,9 +78,9 @@ def test_training_batches_alone_have_photographs(source: RenderedSource, photos:
     assert tested.mask_weight is None
 
 
-@pytest.mark.parametrize("change", [{"z": 3500.0, "x": 0.0, "y": 0.0}, {"box": [30, 30, 34, 34], "x": 0.0, "y": 0.0}])
+@pytest.mark.parametrize("change", [{"z": 90.0, "x": 0.0, "y": 0.0}, {"box": [30, 30, 34, 34], "x": 0.0, "y": 0.0}])
 def test_labels_that_do_not_fit_the_renders_are_refused(source: RenderedSource, photos: Path, change: dict) -> None:
-    """Millimetres instead of metres, and boxes that are far smaller than the object."""
+    """Positions far beyond those of the renders, and boxes that are far smaller than the object."""
     file = photos / "metadata.jsonl"
     lines = [json.loads(line) | change for line in file.read_text().splitlines()]
     file.write_text("".join(json.dumps(line) + "\n" for line in lines))
