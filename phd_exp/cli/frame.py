@@ -10,7 +10,7 @@ from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import NamedTuple
 
-from phd_exp.records.errors import CONTROLS, ConfigError, UserError, in_user_code, install, one_line
+from phd_exp.records.errors import CONTROLS, ConfigError, RunError, UserError, in_user_code, install, one_line
 from phd_exp.records.processes import announce
 
 RESUMES = "the same command resumes"
@@ -50,7 +50,9 @@ def failure(error: BaseException) -> Ending:
     if isinstance(error, Stopped):
         return Ending("interrupted", (f"stopped by {error}; {RESUMES}",), 128 + error.signum)
     if isinstance(error, UserError):
-        return Ending("failed", tuple(str(error).splitlines()), 2 if isinstance(error, ConfigError) else 1)
+        several = isinstance(error, ConfigError | RunError)  # of other errors, a line break is a stranger's
+        lines = tuple(str(error).splitlines()) if several else (str(error),)
+        return Ending("failed", lines, 2 if isinstance(error, ConfigError) else 1)
     if isinstance(error, ModuleNotFoundError) and (remedy := install(error.name or "")):
         return Ending("failed", (f"{error}{remedy}",), 2)
     # torch raises a RuntimeError on a CPU, and a class of the second name on a GPU

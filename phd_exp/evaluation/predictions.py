@@ -88,7 +88,7 @@ class Evaluation:
 def evaluate(table: Arrays, resamples: int = RESAMPLES) -> Evaluation:
     """Evaluate predictions: of a density if the table has its levels, else of points, which have no curves.
 
-    Raises RunError if a column is missing, or if no sample has finite values.
+    Raises RunError if a column is missing, or if fewer than two samples have finite values.
     """
     is_distribution, is_huber = "level" in table, "a" in table
     needed = (*(parameter_names(table) if is_huber else ()), *OF_A_DISTRIBUTION) if is_distribution else ERRORS
@@ -96,6 +96,8 @@ def evaluate(table: Arrays, resamples: int = RESAMPLES) -> Evaluation:
     columns, finite = finite_columns(table, needed, [name for name, _, _ in STRATIFIED_BY.values() if name in table])
     statistic: Statistic = _distribution_scores if is_distribution else _point_scores
     whole, found, reference = statistic, {}, {}
+    if int(finite.sum()) == 1:
+        raise RunError("predictions: one test sample; expected at least two, for intervals")
     if is_huber:
         distribution = _distribution(columns)
         columns |= nees_columns(distribution, stacked(columns, XYZ))

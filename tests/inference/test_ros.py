@@ -424,7 +424,7 @@ SPOILED: dict[str, tuple[Callable[[Path], Any], str, int]] = {
     "empty": (lambda file: file.write_bytes(b""), UNREADABLE + ".*empty", 0),
     "text": (lambda file: file.write_text("no recording"), UNREADABLE + ".*magic", 0),
     "an unprintable topic": (
-        lambda file: write(file, [CAMERA, image(pictures(1)[0], "rgb8", START, "/a\nerror: b")]), r"has no images", 0
+        lambda file: write(file, [CAMERA, image(pictures(1)[0], "rgb8", START, "/a\nerror: b")]), r"/a error: b", 0
     ),
     "missing": (lambda file: None, UNREADABLE + "No such file or directory", 0),
 }  # fmt: skip
