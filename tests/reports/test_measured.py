@@ -16,7 +16,7 @@ STORED = {
     "after": (5, {"all": 25, "nll": -7.58325, "nees": 3.30439}),
     "fusion": (1, {"all": 176, "depth_error_mm/mode/2/free": 14.1506, "coverage_90/gaussian/4/ground": 71.95}),
     "pairs": (1, {"all": 1, "fused_error_mm": 23.2213}),
-    "tracks": (3, {"all": 38, "depth_error_mm/single": 199.206, "nees/slow": 0.53718}),
+    "tracks": (4, {"all": 38, "depth_error_mm/single": 199.206, "nees/slow": 0.53718}),
     "gallery": (1, {"all": 2, "best": 42.5, "worst": 42.19}),
     "scene": (1, {"all": 2, "mode_z": 3.7408, "extent_90": 1.7036}),
     "shifts": (1, {"all": 29, "inside_90": 93.75, "unfamiliar": 100.0}),
