@@ -48,7 +48,8 @@ def require_output(out: Path, name: str, arguments: Arguments, inputs: Iterable[
     try:
         start = beginning(out)
     except OSError as error:
-        raise ConfigError(f"{key}={out}: {error.strerror}; expected a new file, such as {name}") from None
+        fault, _, _ = str(error.strerror).partition(";")
+        raise ConfigError(f"{key}={out}: {fault}; expected a new file, such as {name}") from None
     _require_unread(out, [out, _place(out).parent], arguments, inputs, key)
     _require_outside_run(out, arguments, key, name)
     if start and not re.match(KINDS[Path(name).suffix], start, re.DOTALL):

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from phd_exp.evaluation.parquet import read_table
-from phd_exp.evaluation.point_errors import READINGS, ErrorKey, MeanErrors, in_central_half, mean_errors
+from phd_exp.evaluation.point_errors import READINGS, ErrorKey, MeanErrors, in_central_half, mean_errors, significant
 from phd_exp.records.errors import RunError
 from tests.support.recorded import Predicted, by_hand, predicted
 
@@ -116,3 +116,9 @@ def test_rows_are_bounded_before_they_are_read(tmp_path: Path) -> None:
     assert (tmp_path / "predictions.parquet").stat().st_size < 200_000
     with pytest.raises(RunError, match=r"has 900000 rows of 30 columns.*expected at most"):
         read_table(tmp_path / "predictions.parquet")
+
+
+@pytest.mark.parametrize("value", [float("nan"), 1.5, -0.1])
+def test_no_hypothesis_is_rejected_by_what_is_no_probability(value: float) -> None:
+    with pytest.raises(ValueError, match="expected probabilities"):
+        significant({"a": value, "b": 0.5})
