@@ -170,7 +170,7 @@ class Predictor:
 
         With `guarantees`, only every second one is used, so that the others can `guarantee`. Raises as `held_out`.
         """
-        return self._tempered(self.held_out(), guarantees)
+        return self._tempered(self.held_out(), self.folders[0].path, guarantees)
 
     def calibrated(self, name: str, *, guarantees: bool = False) -> "Predictor":
         """The same with temperatures fitted to a record of `calibrate`.
@@ -194,12 +194,15 @@ class Predictor:
                 f"calibration: {file} is of views with margin={recorded:g}; got margin={self.margin:g}; expected the "
                 "same: `calibrate` again, or change margin="
             )
-        return replace(self._tempered(table, guarantees), labelled=file)
+        return replace(self._tempered(table, file, guarantees), labelled=file)
 
-    def _tempered(self, table: "Arrays", guarantees: bool) -> "Predictor":
+    def _tempered(self, table: "Arrays", file: Path, guarantees: bool) -> "Predictor":
         from phd_exp.evaluation.predictions import fit_temperature  # imports pyarrow
 
-        temperature = fit_temperature(table, choosing(table) if guarantees else slice(None))
+        try:
+            temperature = fit_temperature(table, choosing(table) if guarantees else slice(None))
+        except RunError as error:
+            raise RunError(f"{file}: {error}") from None
         return replace(self, temperature=temperature, guarantees=guarantees)
 
     def guarantee(self, coverage: float, groups: "Groups | None" = None) -> "Guarantee":

@@ -17,7 +17,7 @@ from phd_exp.distributions.regions import PRECISIONS
 from phd_exp.distributions.rounded import depth_law
 from phd_exp.evaluation.conformal import fused_guarantee
 from phd_exp.inference import pictures
-from phd_exp.records.errors import ConfigError
+from phd_exp.records.errors import ConfigError, RunError
 from phd_exp.records.runs import RunFolder
 from tests.evaluation.test_conformal import table_of
 from tests.support.several import write_views
@@ -154,6 +154,13 @@ def test_the_exported_file_has_the_threshold_and_the_energy_of_its_regions(
         torch.testing.assert_close(found_level, torch.full_like(PRECISIONS, region["level"]))
     assert phd_exp("export", f"run={run.path}", "out=network.onnx").status == 0
     assert "region" not in json.loads(models.load("network.onnx").metadata_props[0].value)
+
+
+def test_temperatures_that_do_not_fit_name_the_run(make: Callable) -> None:
+    run = make(*NOWHERE)
+    pd.DataFrame(table_of(40, 1) | {"a": np.full(40, -1.0)}).to_parquet(run.held_out)
+    with pytest.raises(RunError, match=rf"^{run.path}: predictions: parameters are of no distribution"):
+        package.load(run.path, recalibrate=True)
 
 
 def test_samples_that_chose_temperatures_guarantee_nothing(run: RunFolder) -> None:
