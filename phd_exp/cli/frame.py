@@ -15,7 +15,7 @@ from phd_exp.records.processes import announce
 
 RESUMES = "the same command resumes"
 HOME = re.compile(r"(?<=[=,'\"\[])~[\w.-]*(?=[/,'\"\]]|$)")
-"""A home folder at the beginning of a value; a shell replaces only those that begin a word."""
+"""`~` or `~user` at the beginning of a value. A shell expands it only at the beginning of a word."""
 
 
 class Stopped(SystemExit):

@@ -254,7 +254,9 @@ class Predictor:
         return VirtualCamera.of_box(K, enlarged(box, self.margin), float(self.side), lens, self.largest_f)
 
     def see(self, views: View | Sequence[View]) -> Prediction:
-        """Predictions for views, each in the frame of its own virtual camera; for one view, one without a batch.
+        """Predictions for views, each in the frame of its own virtual camera.
+
+        A single view gives a prediction without a batch dimension.
 
         Warns (UserWarning) if the focal length of a view is beyond those of the training.
         """

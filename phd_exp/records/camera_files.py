@@ -101,10 +101,10 @@ def _of_numbers(rows: list[list[str]]) -> dict[str, Any]:
     """K, as `numpy.savetxt` writes it, or fx, fy, cx, cy, and maybe k1, k2, p1, p2 and k3, on one line."""
     if [len(row) for row in rows] == [3, 3, 3]:
         return {"K": rows}
-    (row,) = rows if len(rows) == 1 else [[word for row in rows for word in row]]
-    if len(rows) == 1 and len(row) in (4, 8, 9):
-        return {"K": row[:4], "D": row[4:], "distortion_model": "plumb_bob" if row[4:] else "none"}
-    raise ValueError(f"{len(row)} numbers; expected K, 3 x 3, or one line of fx fy cx cy, or with k1 k2 p1 p2")
+    words = [word for row in rows for word in row]
+    if len(rows) == 1 and len(words) in (4, 8, 9):
+        return {"K": words[:4], "D": words[4:], "distortion_model": "plumb_bob" if words[4:] else "none"}
+    raise ValueError(f"{len(words)} numbers; expected K, 3 x 3, or one line of fx fy cx cy, or with k1 k2 p1 p2")
 
 
 def _of_colmap(words: list[str]) -> dict[str, Any]:

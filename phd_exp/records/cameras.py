@@ -138,9 +138,10 @@ def _read_out(sensor: Calibration, found: Found, image: tuple[int, int] | None) 
     if not any((x, y, *cut)) and bins == [1, 1]:
         return sensor
     full, whole = sensor.intrinsics, (sensor.width or 0, sensor.height or 0)
-    width, height = image or ((cut[0] or whole[0]) // bins[0], (cut[1] or whole[1]) // bins[1])
+    expected = (cut[0] or whole[0]) // bins[0], (cut[1] or whole[1]) // bins[1]
+    width, height = image or expected
     K = np.diag([*np.divide(1, bins), 1]) @ (full - [[0, 0, x], [0, 0, y], [0, 0, 0]])
-    if image and image != ((cut[0] or whole[0]) // bins[0], (cut[1] or whole[1]) // bins[1]):
+    if image and image != expected:
         nearer, farther = (np.linalg.norm(one[:2, 2] - np.divide(image, 2)) for one in (K, full))
         if image != whole or nearer > farther:
             raise ValueError(

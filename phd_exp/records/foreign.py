@@ -72,8 +72,8 @@ def expected_in(folder: Path) -> str:
     coco = ", ".join(COCO_FILES).format(*[folder.absolute().name] * 2)
     return (
         f"no annotations; found {_names_in(folder)}; expected metadata.jsonl, */scene_gt.json (BOP), "
-        f"or one of {coco} (COCO); {RULE}; predict "
-        "takes images alone too, with f=PIXELS or camera=FILE"
+        f"or one of {coco} (COCO); {RULE}; "
+        "predict takes images alone too, with f=PIXELS or camera=FILE"
     )
 
 
