@@ -1,12 +1,14 @@
-"""Write the tables of results in README and guides from the files of this folder.
+"""Write the tables of results in README and the pages of this folder from its files.
 
     python docs/results/write.py                  # after the results have changed
     python docs/results/write.py --check          # exit status 1 if a page differs from them
     python docs/results/write.py --take report    # first take the numbers of a report
 
 `runs.csv`, `tables.csv`, `calibration.csv` and `heads.csv` hold lines of the same files in `<report>/tables/`;
-what is taken again replaces its lines. Lines of models that left (docs/ideas/heads.md) were measured with commit
-05c5d40 (package version 0.1.0) or before. A table stands between `<!-- results: NAME -->` and `<!-- end -->`.
+what is taken again replaces its lines. `photographs.csv`, `tracks.csv` and `further.csv` are of
+notebooks and experiments that the pages name. Lines of models that left (docs/results/densities.md) were measured
+with commit 05c5d40 (package version 0.1.0) or before.
+A table stands between `<!-- results: NAME -->` and `<!-- end -->`.
 """
 
 import argparse
@@ -25,7 +27,7 @@ from phd_exp.reports.table import NOTHING
 
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
-PAGES = ("README.md", "docs/guides/tables.md", "docs/ideas/heads.md")
+PAGES = ("README.md", *(f"docs/results/{page.name}" for page in sorted(HERE.glob("*.md"))))
 BLOCK = re.compile(r"(<!-- results: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 KEYS = {
     "runs": ["preset", "data", "model", "seed", "overrides"],
@@ -249,6 +251,63 @@ def compared(lines: pd.DataFrame, digits: int) -> str:
     return f"{text}<br>{gap:+.{digits}f} ± {float(first['high']) - gap:.{digits}f}"
 
 
+def photographs(lines: pd.DataFrame) -> str:
+    """Depth errors on photographs, by set."""
+    columns = {
+        "depth_error_percent": "depth error (%)",
+        "projected_error_mm": "projected error (mm)",
+        "inside_50": "inside 50 %",
+        "inside_90": "inside 90 %",
+        "unfamiliar": "unfamiliar",
+    }
+    table = heading(*columns.values())
+    for name, of_set in lines.groupby("object", sort=False):
+        table += line(f"*{name}, {of_set['photographs'].iloc[0]} photographs*", *[""] * len(columns))
+        for _, one in of_set.iterrows():
+            table += line(one["prediction"], *(one[column] or NOTHING for column in columns))
+    return table
+
+
+def tracks(lines: pd.DataFrame) -> str:
+    """Paths against single frames: errors, ratios and squared errors, a row for each run and kind of sequence."""
+    columns = {
+        "single frames (mm)": ("depth_error_mm", "single", 0),
+        "Kalman": ("ratio/depth_error_mm", "kalman", 2),
+        "independent": ("ratio/depth_error_mm", "independent", 2),
+        "weighted": ("ratio/depth_error_mm", "slow", 2),
+        "hidden": ("ratio/hidden/depth_error_mm", "slow", 2),
+        "closer than Kalman (mm)": ("gain", "slow", 0),
+        "squared error: Kalman": ("nees", "kalman", 1),
+        "weighted ": ("nees", "slow", 2),
+    }
+    table = heading("sequences", *columns)
+    keys = ["data", "cameras", "frames", "model", "run"]
+    for (data, cameras, frames, model, run), found in lines.groupby(keys, sort=False):
+        cells = [interval(chosen(found, quantity=name, method=method), n) for name, method, n in columns.values()]
+        several = f", {cameras} cameras" if cameras != "1" else ""
+        label = f"`{data}`, `{model}`, {run.partition('-')[0]}"
+        table += line(label, f"{found['n_sequences'].iloc[0]} × {frames}{several}", *cells)
+    return table
+
+
+def interval(lines: pd.DataFrame, digits: int) -> str:
+    """A mean and its interval."""
+    if lines.empty:
+        return NOTHING
+    mean, low, high = lines.iloc[0][["mean", "low", "high"]].astype(float)
+    return f"{mean:.{digits}f} ({low:.{digits}f} to {high:.{digits}f})"
+
+
+def further(lines: pd.DataFrame) -> str:
+    """One table of `further.csv`."""
+    columns = list(dict.fromkeys(lines["column"]))
+    table = heading(*columns)
+    for name, found in lines.groupby("row", sort=False):
+        values = dict(zip(found["column"], found["value"], strict=True))
+        table += line(str(name), *(values.get(column) or NOTHING for column in columns))
+    return table
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--check", action="store_true")
@@ -263,6 +322,8 @@ def main() -> int:
     scores = read(HERE / "calibration.csv")
     tables |= {table.__name__: table(scores) for table in of_scores}
     tables["heads"] = heads(read(HERE / "heads.csv"))
+    tables |= {table.__name__: table(read(HERE / f"{table.__name__}.csv")) for table in (photographs, tracks)}
+    tables |= {str(name): further(found) for name, found in read(HERE / "further.csv").groupby("table")}
     differs = False
     for name in PAGES:
         before = (ROOT / name).read_text()

@@ -8,7 +8,7 @@ from phd_exp.distributions.projected_huber import ProjectedHuber
 from phd_exp.distributions.shaped import student_freedom
 
 ROUNDING = 2.0
-"""The rounding of `model=rounded_t`, chosen by the NLL of held-out samples; see docs/ideas/heads.md."""
+"""The rounding of `model=rounded_t`, chosen by the NLL of held-out samples."""
 # log factors of A and a, as polynomials in 1/n: least squares over n >= 2, within 1e-3
 _LOG_PROJECTED = (0.48232, -0.75329, -0.29228, -0.83828)
 _LOG_DEPTH = (0.60748, -0.82139, -0.31717, -0.97420)

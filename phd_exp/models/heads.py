@@ -99,8 +99,8 @@ class DistributionHead:
 class SurrogateHead:
     """Ten raw numbers -> the Projected Huber density with free axis and rounded mode closest to a Student's t.
 
-    Training maximises the likelihood of the Student's t, which leads to better networks (docs/ideas/heads.md). The
-    tenth number gives its degrees of freedom.
+    Training maximises the likelihood of the Student's t, which leads to better networks (docs/results/densities.md).
+    The tenth number gives its degrees of freedom.
 
     Args:
         depth: constants of the data set.

@@ -10,7 +10,7 @@ and the sum over the frames of a duration T is about 1 + T/(2 time). A path mult
 weights. They are positive, so nothing is extrapolated and the energy of the path stays convex.
 
 Source: own derivation. The product of powers of densities is a logarithmic opinion pool (Genest and Zidek, "Combining
-probability distributions", 1986); compared with slow errors as unknowns in docs/guides/tracking.md.
+probability distributions", 1986).
 """
 
 import math
