@@ -10,7 +10,7 @@ Columns, one row per sample; positions are metres in the camera frame:
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal, TypeVar
 
 import numpy as np
@@ -19,7 +19,7 @@ from scipy import special
 from torch import Tensor
 
 from phd_exp.evaluation.parquet import Arrays, require_columns, stacked
-from phd_exp.metrics.bootstrap import Interval, means, resampled
+from phd_exp.metrics.bootstrap import Interval
 from phd_exp.metrics.errors import MILLIMETRES, depth_error, projected_error
 from phd_exp.records.errors import RunError
 
@@ -54,17 +54,11 @@ class ErrorKey:
 
 @dataclass(frozen=True)
 class SampleMean:
-    """A mean over n test samples, with what `difference` and the intervals of tables need.
-
-    Attributes:
-        standard_error: None for a single sample.
-        resampled: the mean over each bootstrap sample of test images; runs with equal n share these samples.
-    """
+    """A mean over n test samples; its standard error is None for a single sample."""
 
     n: int
     value: float
     standard_error: float | None
-    resampled: np.ndarray = field(default_factory=lambda: np.empty(0), repr=False, compare=False)
 
 
 MeanErrors = Mapping[ErrorKey, SampleMean]
@@ -116,34 +110,28 @@ def in_central_half(
 
 def _mean(values: Tensor) -> SampleMean:
     n = len(values)
-    _, drawn = resampled(means, {"mean": values}, RESAMPLES, SEED)
-    return SampleMean(n, float(values.mean()), float(values.std() / n**0.5) if n > 1 else None, drawn["mean"].numpy())
+    return SampleMean(n, float(values.mean()), float(values.std() / n**0.5) if n > 1 else None)
 
 
-def difference(one: Sequence[SampleMean], other: Sequence[SampleMean]) -> Interval[float]:
-    """The mean over seeds of `one` minus that of `other`, with its 95 % interval.
+def paired(one: Mapping[int, float], other: Mapping[int, float]) -> tuple[Interval[float], float]:
+    """The mean over the seeds of both of `one` minus `other`, its 95 % interval, and the p-value of no difference.
 
-    A bootstrap over the seeds of each model and over the shared test images gives the standard error. Deviations of k
-    seeds are scaled by sqrt(k / (k - 1)), and the interval uses Student's law with the seeds' degrees of freedom.
-    With one seed the interval is infinite: nothing is known about other trainings.
+    A paired t-test over n seeds with n - 1 degrees of freedom, two-sided: whether other trainings would differ on
+    these test images. With fewer than two seeds in common the interval is infinite.
 
-    Source: Davison and Hinkley, "Bootstrap methods and their application" (1997), section 2.3 (small samples).
+    Examples:
+        >>> gap, p = paired({0: 1.0, 1: 2.0, 2: 4.0}, {0: 2.0, 1: 3.5, 2: 6.0})
+        >>> round(gap.value, 2), round(gap.high, 2), round(p, 3)
+        (-1.5, -0.26, 0.035)
     """
-    gap = float(np.mean([mean.value for mean in one]) - np.mean([mean.value for mean in other]))
-    if min(len(one), len(other)) < 2:
-        return Interval(gap, -np.inf, np.inf)
-    random = np.random.default_rng(SEED)
-    drawn = _over_seeds(one, random) - _over_seeds(other, random)
-    half_width = float(special.stdtrit(len(one) + len(other) - 2, 0.975) * drawn.std(ddof=1))
-    return Interval(gap, gap - half_width, gap + half_width)
-
-
-def p_value(gap: Interval[float], seeds: int) -> float:
-    """The two-sided p-value of a `difference` of 0, for the seeds of both models together."""
-    if not np.isfinite(gap.high):
-        return 1.0
-    half_width, freedom = max(gap.high - gap.value, np.finfo(float).tiny), seeds - 2
-    return float(2 * special.stdtr(freedom, -special.stdtrit(freedom, 0.975) * abs(gap.value) / half_width))
+    gaps = np.array([one[seed] - other[seed] for seed in sorted(one.keys() & other.keys())])
+    k, gap = len(gaps), float(np.mean(list(one.values())) - np.mean(list(other.values())))
+    if k < 2:
+        return Interval(gap, -np.inf, np.inf), 1.0
+    gap, error = float(gaps.mean()), max(float(gaps.std(ddof=1)) / k**0.5, np.finfo(float).tiny)
+    half_width = float(special.stdtrit(k - 1, 0.975)) * error
+    p_value = float(2 * special.stdtr(k - 1, -abs(gap) / error))
+    return Interval(gap, gap - half_width, gap + half_width), p_value
 
 
 def significant(p_values: Mapping[Key, float], error_rate: float = 0.05) -> set[Key]:
@@ -164,10 +152,3 @@ def significant(p_values: Mapping[Key, float], error_rate: float = 0.05) -> set[
             break
         found.add(key)
     return found
-
-
-def _over_seeds(means: Sequence[SampleMean], random: np.random.Generator) -> np.ndarray:
-    """Resampled means: both seeds and images are drawn anew."""
-    values, k = np.stack([mean.resampled for mean in means]), len(means)
-    weights = random.multinomial(k, [1 / k] * k, values.shape[1]).T / k
-    return np.asarray((values * (1 / k + np.sqrt(k / (k - 1)) * (weights - 1 / k))).sum(0))

@@ -20,7 +20,7 @@ from phd_exp.metrics.bootstrap import Interval, Statistic, bands, interval, mean
 from phd_exp.metrics.calibration_scores import COLUMNS, abscissae, calibration_scores, curves, ordered
 from phd_exp.metrics.errors import MILLIMETRES
 from phd_exp.metrics.groups import worst_group
-from phd_exp.metrics.strata import strata
+from phd_exp.metrics.strata import strata as split
 from phd_exp.records.errors import RunError
 
 XYZ = ("x", "y", "z")
@@ -85,7 +85,7 @@ class Evaluation:
     resampled: dict[str, list[float]] = field(default_factory=dict)
 
 
-def evaluate(table: Arrays, resamples: int = RESAMPLES) -> Evaluation:
+def evaluate(table: Arrays, resamples: int = RESAMPLES, stratified: bool = True) -> Evaluation:
     """Evaluate predictions: of a density if the table has its levels, else of points, which have no curves.
 
     Raises RunError if a column is missing, or if fewer than two samples have finite values.
@@ -108,7 +108,8 @@ def evaluate(table: Arrays, resamples: int = RESAMPLES) -> Evaluation:
         y = {name: band.each(Tensor.tolist) for name, band in bands(curves, columns, resamples, SEED).items()}
         found = {name: Curve(x[name].tolist(), band.value, band.low, band.high) for name, band in y.items()}
     scored = evaluation_of(whole, columns, int((~finite).sum()), resamples)
-    return replace(scored, curves=found, strata=_strata(statistic, columns, resamples), reference=reference)
+    strata = _strata(statistic, columns, resamples) if stratified else []
+    return replace(scored, curves=found, strata=strata, reference=reference)
 
 
 def evaluation_of(statistic: Statistic, columns: Mapping[str, Tensor], left_out: int, resamples: int) -> Evaluation:
@@ -216,7 +217,7 @@ def scalar_bands(
 def _strata(statistic: Statistic, columns: Mapping[str, Tensor], resamples: int) -> list[Stratum]:
     found = []
     for quantity, (column, unit, edges) in STRATIFIED_BY.items():
-        for label, mask in strata(quantity, columns[column], edges, unit).items() if column in columns else ():
+        for label, mask in split(quantity, columns[column], edges, unit).items() if column in columns else ():
             part, n = {name: values[mask] for name, values in columns.items()}, int(mask.sum())
             found += [Stratum(quantity, label, n, scalar_bands(statistic, part, resamples))] if n > 1 else []
     return found

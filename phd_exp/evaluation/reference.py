@@ -1,6 +1,6 @@
 """The scores that a calibrated model would have: for finitely many samples, no distance from calibration is zero."""
 
-from functools import cache
+from functools import cache, lru_cache
 
 import torch
 from jaxtyping import Float
@@ -12,14 +12,17 @@ from phd_exp.metrics.bootstrap import Interval
 from phd_exp.metrics.calibration import ence_of, miscalibration_area, uniform_distance
 from phd_exp.metrics.calibration_scores import ence_bins
 from phd_exp.metrics.errors import MILLIMETRES
-from phd_exp.metrics.groups import similar_groups, worst_group
+from phd_exp.metrics.groups import DIRECTIONS, similar_groups, worst_group
 from phd_exp.metrics.ordered import Ordered, in_order_of
 
 SEED = 1
 _SHARES = torch.tensor([0.5, 0.025, 0.975], dtype=torch.float64)
-_AT_ONCE = 200_000  # samples simulated at a time
-_DRAWS, _FEWEST_DRAWS = 100_000, 200
+_AT_ONCE = 50_000  # samples simulated at a time: more take the processor's time for memory
+_DRAWS, _FEWEST_DRAWS = 30_000, 100
 """Positions drawn from all predictions, and at least from each."""
+_EXPECTED = {"nees": 3.0, "nees_x": 1.0, "nees_y": 1.0, "nees_z": 1.0}
+_SIMULATED, _FEWEST_SIMULATIONS = 400_000, 1000
+"""Samples of all simulated test sets together, and the fewest test sets."""
 REFERENCED = (
     *("depth_ence", "projected_ence", "inside_90", "miscalibration_area", "depth_pit_area", "depth_pit_ks"),
     *("group_miscalibration", "depth_crps_mm", *NEES),
@@ -31,23 +34,22 @@ def calibrated_reference(distribution: ProjectedHuber, simulations: int = 4000) 
 
     ENCE, CRPS and NEES depend on the predicted densities, so positions are drawn from them: each simulated test set
     takes one of many draws from each prediction. Credible levels and PITs of a calibrated model are uniform for any
-    prediction: their scores depend on the number of samples alone. The number inside a region is binomial.
+    prediction: their scores depend on the number of samples alone, and on the groups. The number inside a region is
+    binomial. Of many samples, fewer test sets are simulated where draws or groups count.
 
     Source: the simulated null distribution of a test statistic; coverage in tests/evaluation/test_reference.py.
     """
     (n,) = distribution.batch_shape
+    times = min(simulations, max(_FEWEST_SIMULATIONS, _SIMULATED // n))
     many = min(simulations, max(_FEWEST_DRAWS, _DRAWS // n))
-    scored = _scored(distribution, draws(distribution, many, SEED))
-    groups, generator = groups_of(distribution), torch.Generator().manual_seed(SEED)
     squared = squared_error_columns(distribution, distribution.mode)
     variances = {name: squared[f"{name}_variance"] for name in ("depth", "projected")}
-    found: dict[str, list[Tensor]] = {name: [values] for name, values in _uniform(n, simulations).items()}
-    for size in _sizes(n, simulations):
-        levels = torch.rand(size, n, generator=generator)
-        of_groups = {"group_miscalibration": worst_group(levels, groups, torch.ones_like(levels))}
-        for name, values in (of_groups | _simulated(scored, variances, size, generator)).items():
-            found.setdefault(name, []).append(values)
-    bands = {name: torch.cat(values).double().quantile(_SHARES) for name, values in found.items()}
+    scored = _scored(distribution, draws(distribution, many, SEED), variances)
+    generator = torch.Generator().manual_seed(SEED)
+    parts = [_simulated(scored, variances, size, generator) for size in _sizes(n, times)]
+    found = {name: torch.cat([part[name] for part in parts]) for name in parts[0]} | _uniform(n, simulations)
+    found["group_miscalibration"] = _of_groups(groups_of(distribution).numpy().tobytes(), n, times)
+    bands = {name: values.double().quantile(_SHARES) for name, values in found.items()}
     from scipy import stats  # takes half a second
 
     bands["inside_90"] = 100 * torch.from_numpy(stats.binom.ppf(_SHARES, n, 0.9)) / n
@@ -59,10 +61,12 @@ def groups_of(distribution: ProjectedHuber) -> Tensor:
     return similar_groups(torch.stack(list(parameter_columns(distribution).values()), -1))
 
 
-def _scored(distribution: ProjectedHuber, drawn: Float[Tensor, "draws samples 3"]) -> Columns:
-    """The scores of each draw, (samples, draws)."""
+def _scored(distribution: ProjectedHuber, drawn: Float[Tensor, "draws samples 3"], variances: Columns) -> Columns:
+    """The scores of each draw, (samples, draws), scaled to their exact means over all predictions where known."""
     crps = {"depth_crps_mm": MILLIMETRES * distribution.depth_crps(drawn[..., 2])}
     columns = nees_columns(distribution, drawn) | squared_error_columns(distribution, drawn) | crps
+    expected = _EXPECTED | {f"{name}_squared_error": float(variance.mean()) for name, variance in variances.items()}
+    columns |= {name: columns[name] * (mean / columns[name].mean()) for name, mean in expected.items()}
     return {name: column.mT.contiguous() for name, column in columns.items() if column.ndim > 1}
 
 
@@ -88,6 +92,15 @@ def _uniform(n: int, simulations: int) -> Columns:
         found.append(torch.stack([miscalibration_area(order), uniform_distance(order)]))
     areas, distances = torch.cat(found, -1)
     return {"miscalibration_area": areas, "depth_pit_area": areas, "depth_pit_ks": distances}
+
+
+@lru_cache(maxsize=2)
+def _of_groups(groups: bytes, n: int, simulations: int) -> Tensor:
+    """The worst-group miscalibration of uniform levels. A temperature keeps the groups."""
+    generator = torch.Generator().manual_seed(SEED)
+    members = torch.frombuffer(bytearray(groups), dtype=torch.float32).view(DIRECTIONS, -1, n)
+    drawn = (torch.rand(size, n, generator=generator) for size in _sizes(n, simulations))
+    return torch.cat([worst_group(levels, members, torch.ones_like(levels)) for levels in drawn])
 
 
 def _sizes(n: int, simulations: int) -> list[int]:

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from phd_exp.distributions.constraints import SCALE, Finding, findings
-from phd_exp.evaluation.point_errors import SampleMean, difference, p_value, significant
+from phd_exp.evaluation.point_errors import SampleMean, paired, significant
 from phd_exp.metrics.bootstrap import Interval
 from phd_exp.records.choices import in_words
 from phd_exp.reports.cells import interval
@@ -19,7 +19,7 @@ COLUMNS = ("nll", "depth_crps_mm", "inside_90", "log_volume", "projected_error_m
 COVERAGE = "inside_90"  # best at 90 %, so that no difference is better
 OF_A_CELL = (
     "A cell: the mean over seeds with its 95 % interval; below it the difference to the probabilistic model with its "
-    "95 % interval, a bootstrap over seeds and the shared test images. Bold: better than the probabilistic model by "
+    "95 % interval, a paired t-test over seeds. Bold: better than the probabilistic model by "
     "that test, corrected for the number of comparisons in the table (Holm, 5 %); never one seed or coverage. "
     "Breaks: the constraints that the head violates, of the seven, as measured."
 )
@@ -70,7 +70,7 @@ def _means(runs: Sequence[Run], name: str) -> list[SampleMean]:
     found = [e for e in every if e and name in e.scores]
     if len(found) < len(runs):
         return []
-    return [SampleMean(e.n, e.scores[name].value, None, np.array(e.resampled[name])) for e in found]
+    return [SampleMean(e.n, e.scores[name].value, None) for e in found]
 
 
 def _table(preset: str, data: str, digest: str, models: dict[str, list[Run]]) -> Table:
@@ -79,12 +79,14 @@ def _table(preset: str, data: str, digest: str, models: dict[str, list[Run]]) ->
     columns = [name for name in COLUMNS if any(means[model, name] for model in models)]
     gaps = {(model, name): _gap(models, means, model, name) for model in models for name in columns}
     known = {place: gap for place, gap in gaps.items() if gap and place[1] != COVERAGE}
-    seeds = {model: len(runs) + len(models[PROBABILISTIC]) for model, runs in models.items()}
-    sure = significant({(model, name): p_value(gap, seeds[model]) for (model, name), gap in known.items()})
+    sure = significant({place: p_value for place, (_, p_value) in known.items()})
     for model, runs in models.items():
         broken = ", ".join(name[0] for name, row in constraints.items() if model in row and not row[model].holds)
         stub = (model, broken or NOTHING, ", ".join(str(run.seed) for run in runs))
-        cells = [_cell(name, runs, means[model, name], gaps[model, name], (model, name) in sure) for name in columns]
+        cells = []
+        for name in columns:
+            gap, _ = gaps[model, name] or (None, 1.0)
+            cells.append(_cell(name, runs, means[model, name], gap, (model, name) in sure))
         rows.append(TableRow(stub, tuple(cells)))
     return Table(
         stem=file_stem("heads", preset, data, *([digest] if digest else [])),
@@ -101,14 +103,18 @@ def _table(preset: str, data: str, digest: str, models: dict[str, list[Run]]) ->
 
 def _gap(
     models: dict[str, list[Run]], means: dict[tuple[str, str], list[SampleMean]], model: str, name: str
-) -> Interval[float] | None:
+) -> tuple[Interval[float], float] | None:
     """The difference to the probabilistic model; None for that model itself, or tests on other images."""
     ours, others = means[model, name], means[PROBABILISTIC, name]
     runs = (*models[model], *models[PROBABILISTIC])
     same = {(run.measured.images, mean.n) for run, mean in zip(runs, (*ours, *others), strict=False)}
     if model == PROBABILISTIC or not ours or not others or len(same) > 1:
         return None
-    return difference(ours, others)
+    by_seed = (
+        {run.seed or 0: mean.value for run, mean in zip(models[name], found, strict=True)}
+        for name, found in ((model, ours), (PROBABILISTIC, others))
+    )
+    return paired(*by_seed)
 
 
 def _cell(

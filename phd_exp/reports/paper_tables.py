@@ -31,7 +31,7 @@ OF_THE_READING: dict[Reading, str] = {
 }
 OF_A_CELL = (
     "A cell: our mean error in mm; below it the paper's figure and (× ours / paper). Bold: smaller than every other "
-    "model of its column by a 95 % paired test, a bootstrap over seeds and the shared test images; never one seed."
+    "model of its column by a 95 % paired t-test over seeds; never one seed."
 )
 OF_THE_SPLITS = "Held-out training samples chose the recipe and fitted the temperatures. Test samples chose nothing."
 OF_AN_INTERVAL = {

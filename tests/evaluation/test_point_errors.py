@@ -60,17 +60,6 @@ def test_few_samples_have_no_mean_or_no_standard_error() -> None:
     assert {(mean.n, mean.standard_error) for mean in found.values()} == {(1, None)}
 
 
-def test_runs_on_the_same_images_are_resampled_alike(drawn: Predicted) -> None:
-    """Resamples of two runs can be subtracted: equal errors cancel."""
-    frame = drawn.frame
-    worse = frame.assign(mode_z=frame["mode_z"] + 0.001)
-    key = ErrorKey("mode", "whole", "depth")
-    first, same, other = (means(table, ("mode",))[key].resampled for table in (frame, frame, worse))
-    np.testing.assert_array_equal(first, same)
-    assert np.std(other - first) < np.std(first)
-    assert np.std(first) == pytest.approx(means(frame, ("mode",))[key].standard_error, rel=0.3)
-
-
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [

@@ -12,8 +12,8 @@ from tests.support.several import write_views
 from tests.support.synthetic import write_run
 
 STORED = {
-    "before": (3, {"all": 26, "nll": -6.64295, "nees": 12.4995, "depth_ence": 0.866212}),
-    "after": (5, {"all": 25, "nll": -7.58325, "nees": 3.30439}),
+    "before": (4, {"all": 26, "nll": -6.64295, "nees": 12.4995, "depth_ence": 0.866212}),
+    "after": (6, {"all": 25, "nll": -7.58325, "nees": 3.30439}),
     "fusion": (1, {"all": 176, "depth_error_mm/mode/2/free": 14.1506, "coverage_90/gaussian/4/ground": 71.95}),
     "pairs": (1, {"all": 1, "fused_error_mm": 23.2213}),
     "tracks": (4, {"all": 38, "depth_error_mm/single": 199.206, "nees/slow": 0.53718}),
