@@ -141,6 +141,21 @@ def summary(cells: pd.DataFrame) -> str:
     return table
 
 
+def readme(cells: pd.DataFrame, scores: pd.DataFrame) -> str:
+    """The paper's errors, ours in the central half and in the whole field, and the share inside the 90 % region."""
+    table = heading(*DATA) + paper("paper, central half of the field")
+    choice = {"preset": PRESET, "estimate": "mode", "model": "probabilistic", "table": "table1"}
+    for reading, label in {
+        "central": "`preset=full recipe=strong`, central half",
+        "whole": "the same, whole field",
+    }.items():
+        table += row(label, [both_errors(cells, data=data, reading=reading, **choice) for data in DATA])
+    kept = chosen(scores, preset=PRESET, model="probabilistic", predictions="as trained", quantity="inside_90")
+    kept = kept[kept["run"].str.fullmatch(r"seed\d+")]
+    shares = [chosen(kept, data=data)["value"].astype(float).mean() for data in DATA]
+    return table + line("inside the 90 % region, whole field", *(f"{share:.1f} %" for share in shares))
+
+
 def coverage(scores: pd.DataFrame) -> str:
     """Share inside the 90 % region and NEES of the probabilistic model with the authors' positions."""
     table = heading("`default`: inside the 90 % region", "NEES", "`occl`: inside the 90 % region", "NEES")
@@ -321,6 +336,7 @@ def main() -> int:
     of_scores = [calibration, coverage]
     scores = read(HERE / "calibration.csv")
     tables |= {table.__name__: table(scores) for table in of_scores}
+    tables["readme"] = readme(cells, scores)
     tables["heads"] = heads(read(HERE / "heads.csv"))
     tables |= {table.__name__: table(read(HERE / f"{table.__name__}.csv")) for table in (photographs, tracks)}
     tables |= {str(name): further(found) for name, found in read(HERE / "further.csv").groupby("table")}

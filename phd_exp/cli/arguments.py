@@ -14,6 +14,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 
 from phd_exp.records.detections import Detection
 from phd_exp.records.errors import ConfigError, DatasetError, RunError, complaint, listed, one_line, unknown
+from phd_exp.records.packed import or_example
 from phd_exp.records.processes import announce
 from phd_exp.records.recordings import Detections
 
@@ -78,13 +79,13 @@ Beyond = Annotated[bool, Field(description=ANYWAY)]
 
 
 def _paths(text: str) -> list[str]:
-    """Paths separated by commas, and those that match patterns, sorted."""
+    """Paths separated by commas, those that match patterns, sorted, and names of the examples of the package."""
     found = []
     for part in [text] if os.path.exists(text) else text.split(","):
         matching = sorted(glob(part, recursive=True)) if has_magic(part) and not os.path.exists(part) else [part]
         if not matching:
             raise ValueError(f"no path matches {part}; expected a pattern such as images/*.png")
-        found += matching
+        found += [str(or_example(Path(path))) for path in matching]
     return found
 
 

@@ -18,7 +18,7 @@ from phd_exp.models.regressor import Regressor
 from phd_exp.models.weights import fill, regressor_weights
 from phd_exp.records.choices import first_difference, has_influence
 from phd_exp.records.errors import ConfigError, RunError, UserError, gist, listed
-from phd_exp.records.packed import opened
+from phd_exp.records.packed import opened, or_example
 from phd_exp.records.runs import RunFolder
 
 OF_THE_INPUT = ("data.", "camera.", "model.head.")  # keys in which the members of an ensemble agree
@@ -36,7 +36,8 @@ def load(
     """The network of a run's best checkpoint, or its last; or an ensemble of several runs or views.
 
     Args:
-        run: the run's folder, or a file of `pack`; several, or a folder of seeds, for an ensemble.
+        run: the run's folder, a file of `pack`, or `cylinder`, which comes with the package; several,
+            or a folder of seeds, for an ensemble.
         device: "auto" chooses a GPU if there is one.
         recalibrate: apply temperatures fitted to the run's predictions of all held-out samples.
         trust: packages other than phd_exp whose classes the run may build; None: any.
@@ -61,7 +62,7 @@ def load(
 
 def _members(runs: Sequence[str | Path]) -> tuple[list[RunFolder], Callable[[str], bool]]:
     """The runs to load, and which keys of theirs must be equal. A folder of seeds stands for its finished runs."""
-    folders = [opened(Path(run)) for run in runs]
+    folders = [opened(or_example(Path(run))) for run in runs]
     if len(folders) == 1 and not folders[0].config_file.exists():
         seeds = [RunFolder(path) for path in sorted(folders[0].path.glob("seed*"))]
         if finished := [seed for seed in seeds if seed.is_finished()]:

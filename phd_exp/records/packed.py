@@ -36,6 +36,7 @@ NAMES = re.compile("|".join(map(re.escape, (CARD, WEIGHTS, *RECORDS))) + f"|{TAB
 LARGEST = 4000 * MB  # bytes of an archive, whose format without extensions ends at 4 GiB
 MOST_FILES = 1000
 LARGEST_LIST = MB // 4  # bytes of the list of files at the end of an archive
+EXAMPLES = Path(__file__).parents[1] / "examples"
 END, END_OF_LARGE = b"PK\x05\x06", b"PK\x06\x07"  # signatures of the format
 
 
@@ -63,6 +64,12 @@ def write_packed(file: Path, contents: Mapping[str, bytes]) -> None:
             entry.create_system, entry.external_attr = 3, (stat.S_IFREG | 0o644) << 16
             stream.writestr(entry, content)
     write_atomic(file, archive.getvalue())
+
+
+def or_example(path: Path) -> Path:
+    """The path, or what comes with the package by this name if nothing is there: `cylinder`, `cylinder.png`."""
+    found = [file for name in (path.name, f"{path.name}.zip") if (file := EXAMPLES / name).is_file()]
+    return found[0] if found and path == Path(path.name) and not path.exists() else path
 
 
 def opened(path: Path) -> RunFolder:

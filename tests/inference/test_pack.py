@@ -70,6 +70,15 @@ def test_a_packed_run_predicts_as_its_folder(phd_exp: Callable, run: RunFolder, 
         assert not any(b"secret" in archive.read(name) for name in archive.namelist() if name != "config.yaml")
 
 
+def test_the_example_of_the_package_contains_the_truth(
+    phd_exp: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)  # nothing of its name is there
+    outcome = phd_exp("predict", "run=cylinder", "image=cylinder.png", "f=1562.5")
+    low, high = json.loads(outcome.out)["depth_interval"]["90"]
+    assert low < 4.381 < high < 1.3 * low
+
+
 def test_the_files_are_there_as_long_as_the_predictor(phd_exp: Callable, run: RunFolder, tmp_path: Path) -> None:
     assert phd_exp("pack", f"run={run.path}").status == 0
     predictor = package.load(run.path / "run.zip")
