@@ -4,11 +4,9 @@
         manifest.json                 what made the folder, and how many samples are finished
         <split>/000123.png            images (.webp, .jpg)
         <split>/metadata.jsonl        one line per sample, sorted by index
-        <split>/metadata.partial.jsonl    only while rendering: one line per finished image
-        <split>/metadata.partial-0-of-4.jsonl    the same for one of several shards
         masks.npy, clearings.npy      where training images show the object, and no object (`rendering/masks.py`)
         masks.json, clearings.json    the version of the drawing of each
-        .cache/                       data that programs derive from the images
+        .cache/                       data that programs derive from the images; while rendering, a record for each
 
 `SampleRecord` describes a line. The arrays follow from the lines; the manifest does not count them.
 """
@@ -28,7 +26,7 @@ from phd_exp.records.errors import DatasetError, gist
 from phd_exp.records.files import read_jsonl, read_plain, require_plain, write_atomic
 from phd_exp.records.parsing import Record, parse_json
 from phd_exp.records.scenes import SampleRecord, Split
-from phd_exp.records.spec import DatasetSpec, ImageFormat, Shard
+from phd_exp.records.spec import DatasetSpec, ImageFormat
 
 SPLITS: tuple[Split, ...] = get_args(Split)
 NO_RESERVE = 0x4000 if sys.platform == "linux" else 0  # MAP_NORESERVE, which Python 3.11 does not name
@@ -79,15 +77,6 @@ class DatasetFolder:
     def metadata_path(self, split: Split) -> Path:
         """The finished samples of a split."""
         return self.root / split / "metadata.jsonl"
-
-    def journal_path(self, split: Split, shard: Shard | None = None) -> Path:
-        """The finished samples of a split, or of a shard of it, while it is rendered."""
-        share = "" if shard is None else f"-{shard.slug}"
-        return self.root / split / f"metadata.partial{share}.jsonl"
-
-    def journals(self, split: Split) -> list[Path]:
-        """The journals on disk, of all shards."""
-        return list(self.split_folder(split).glob("metadata.partial*.jsonl"))
 
     def image_path(self, split: Split, index: int, image_format: ImageFormat = "png") -> Path:
         """The image of a sample."""

@@ -21,7 +21,7 @@ from phd_exp.rendering.blender import Renderer, renderer_version, require_bpy
 from phd_exp.rendering.progress import shown_progress
 from phd_exp.rendering.samples import fast_settings, make_sample
 from phd_exp.rendering.sampling import generator_version
-from phd_exp.rendering.sealing import other_make
+from phd_exp.rendering.sealing import other_make, side_files
 
 DIGITS = 9  # after the point, to which numbers of records agree on all processors and between versions
 LEVEL = 1.0  # of 255, root mean square, within which images do: the path tracer and the denoiser are less exact
@@ -85,7 +85,7 @@ def _metadata(folder: DatasetFolder, split: Split, seal: Seal | None) -> tuple[l
 
 def _strangers(folder: DatasetFolder, split: Split, records: list[SampleRecord]) -> Iterator[str]:
     """Images without a line of metadata, which image loaders would take for samples."""
-    if not records or folder.journals(split):
+    if not records or side_files(folder, split):
         return  # a render that is running or was interrupted has images that are not sealed yet
     for name in sorted(folder.images(split) - {record.file_name for record in records}):
         yield f"{folder.split_folder(split) / name}: no line of metadata.jsonl names it; delete it"

@@ -1,45 +1,31 @@
-"""Make sure that a data set is on disk: render what is missing, resume what was interrupted, then seal the folder.
+"""Make sure that a data set is on disk: render what is missing, then seal the folder (`sealing.py`).
 
-A kill at any moment leaves a folder that the same call completes. The order of writing is: the manifest, which names
-the data set; for each image, the file and then its line in the journal; at the end `metadata.jsonl` from the
-journals, the removal of the journals, and the manifest again, which now counts the samples (`sealing.py`).
-
-Several processes, on one machine or many, may render shares (shards) of one folder at once. Locks, in its `.cache`:
-
-    render.lock              shared by all shards; exclusive for an unsharded render and for the process that seals
-    shard-<i>-of-<n>.lock    exclusive for the process that renders this shard
-    begin.lock               exclusive while the manifest is written first
-
-A finished shard releases its locks and then tries to take `render.lock` exclusively. That fails while another shard
-renders, which tries in its turn, so that the last one to finish seals. If it is killed before, the next render
-finds all work done and seals.
+A sample is a function of the specification, the split and the index alone. So any number of processes, on one machine
+or many, may run the same command on a shared folder: each makes the samples that no other has made or is making, and
+one of them seals. A kill loses the images in progress; the same command resumes. Locks, in `.cache`: a byte of
+`<split>.lock` for each sample while it is made, and `render.lock` while the manifest is written.
 """
 
 import math
 import time
-from collections.abc import Generator, Iterator, Sequence
-from contextlib import ExitStack, closing, contextmanager, suppress
+from collections.abc import Generator, Sequence
+from contextlib import ExitStack, closing, suppress
 from itertools import islice
 from multiprocessing.connection import Connection, wait
 
 from phd_exp.records.dataset import SPLITS, DatasetFolder
 from phd_exp.records.errors import RenderError, UserError, writing
-from phd_exp.records.files import open_journal
-from phd_exp.records.processes import Child, announce, duration, held, usable_cores
-from phd_exp.records.scenes import SampleRecord, Split
+from phd_exp.records.processes import Child, announce, duration, usable_cores
 from phd_exp.records.spec import DatasetSpec, Shard
 from phd_exp.rendering.blender import require_bpy
 from phd_exp.rendering.masks import ensure_drawn
 from phd_exp.rendering.objects import surroundings_of
 from phd_exp.rendering.progress import shown_progress
-from phd_exp.rendering.sealing import Known, Wanted, begin, known_samples, missing, seal
+from phd_exp.rendering.sealing import Sample, begin, seal, side_files, unmade
 
-Samples = Sequence[tuple[Split, int]]
-"""Split and index of each sample."""
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}  # of each worker
 TOGETHER = 128  # samples
 FEWEST_PER_WORKER = 8  # starting one more process costs about as much as rendering this many images
-WAITING = "waiting for it to finish"
 FEWER = "preset=demo, or data.n_train=... data.n_test=..."
 
 
@@ -55,163 +41,103 @@ def ensure_rendered(
 ) -> bool:
     """Render those of the first `n_train` and `n_test` samples that are not on disk; returns whether all are there.
 
-    The masks that training reads are drawn too. If that is impossible, a training that needs them says so.
-
-    An unsharded call waits for other processes in the folder and leaves all samples there. Rendered images are kept,
-    whatever happens: the same call resumes, and the finished folder has the same bytes as one rendered without
-    interruption.
+    The masks that training reads are drawn too. If that is impossible, a training that needs them says so. Rendered
+    images are kept, whatever happens. The finished folder has the same bytes as one rendered without interruption.
 
     Args:
         workers: number of processes; by default one per core, fewer if there is little to do.
         cores: number of cores to use; by default all that this process may use.
-        shard: the share of the samples to render; the last shard to finish seals the folder. Shares of different
-            counts may overlap: samples that another shard has rendered are not rendered again.
+        shard: the share of the samples to render; without one, all samples are there at the end.
         fewer: overrides for fewer images, which a line names if the first forecast is long.
 
     Raises:
         DatasetError: the folder holds another data set, or a broken one.
         RenderError: bpy is missing, a worker died, the folder cannot be written.
     """
-    if not any(folder.missing(spec, n_train, n_test).values()):
-        with suppress(UserError):
-            ensure_drawn(folder, spec, n_train)
-        return True
-    require_bpy()
-    with writing(folder.root):
-        folder.cache.mkdir(parents=True, exist_ok=True)
-        return _render_share(folder, spec, {"train": n_train, "test": n_test}, workers, cores, shard, fewer)
-
-
-def _render_share(
-    folder: DatasetFolder,
-    spec: DatasetSpec,
-    wanted: Wanted,
-    workers: int | None,
-    cores: int | None,
-    shard: Shard | None,
-    fewer: str,
-) -> bool:
-    """Render the missing samples of a shard, None for all, and seal the folder if it is whole, which is returned."""
-    with _locked(folder, shard):
-        with held(folder.cache / "begin.lock", waiting=f"{folder.root}: waiting for the manifest"):
-            # another process may have begun another data set, or finished this one, in the meantime
-            if not any(folder.missing(spec, wanted["train"], wanted["test"]).values()):
-                return True
+    wanted = (n_train, n_test)
+    if any(folder.missing(spec, *wanted).values()):
+        require_bpy()
+        with writing(folder.root):
+            folder.cache.mkdir(parents=True, exist_ok=True)
             begin(folder, spec)
-        known = known_samples(folder)
-        samples = [sample for sample in missing(known, wanted) if shard is None or shard.holds(sample[1])]
-        try:
-            if samples:
-                _render(folder, spec, samples, known, workers or worker_count(len(samples), cores), shard, fewer)
-        except UserError:
-            if not any(known.values()):  # the next command may have another specification
-                folder.manifest_path.unlink(missing_ok=True)
-            raise
-        if shard is None:
-            seal(folder, spec, known)
-            return True
-    if not samples:
-        announce(f"{folder.root}: nothing left to render in shard {shard}")
-    return _seal_if_last(folder, spec, wanted, shard)
-
-
-@contextmanager
-def _locked(folder: DatasetFolder, shard: Shard | None) -> Iterator[None]:
-    if shard is None:
-        with held(folder.render_lock, waiting=f"{folder.root}: another process is rendering here; {WAITING}"):
-            yield
-        return
-    whole = f"{folder.root}: another process renders all of it; shard {shard} waits for it to finish"
-    twin = f"{folder.root}: another process renders shard {shard}; {WAITING}"
-    with (
-        held(folder.render_lock, shared=True, waiting=whole),
-        held(folder.cache / f"shard-{shard.slug}.lock", waiting=twin),
-    ):
-        yield
-
-
-def _seal_if_last(folder: DatasetFolder, spec: DatasetSpec, wanted: Wanted, shard: Shard) -> bool:
-    with held(folder.render_lock) as alone:
-        known = known_samples(folder)
-        left = len(missing(known, wanted))
-        if alone and not left:
-            seal(folder, spec, known)
-            outcome = f"shard {shard} was the last; the data set is sealed"
-        elif left:
-            outcome = f"shard {shard} is done; {left} samples of other shards are missing"
-        else:
-            outcome = f"shard {shard} is done; another process is still at work here, and seals"
-    announce(f"{folder.root}: {outcome}")
-    return alone and not left
+            left = unmade(folder, spec, *wanted)
+            share = [sample for sample in left if shard is None or shard.holds(sample[1])]
+            if share:
+                is_resumed = len(left) < sum(wanted)
+                n_workers = workers or worker_count(len(share), cores)
+                _render(folder, spec, share, n_workers, fewer, is_resumed=is_resumed)
+            if not seal(folder, spec, *wanted):
+                return False
+    with suppress(UserError):
+        ensure_drawn(folder, spec, n_train)
+    return True
 
 
 def _render(
-    folder: DatasetFolder,
-    spec: DatasetSpec,
-    samples: Samples,
-    known: Known,
-    workers: int,
-    shard: Shard | None,
-    fewer: str,
+    folder: DatasetFolder, spec: DatasetSpec, samples: Sequence[Sample], workers: int, fewer: str, *, is_resumed: bool
 ) -> None:
-    """Render samples and add them to `known`.
-
-    The caller holds the locks. Each record is written to the journal as soon as its image is on disk.
-    """
-    announce(_first_words(folder, spec, len(samples), workers, resumed=any(known.values())))
+    """Make samples, and wait for those that other processes make."""
+    n, many = len(samples), "es" if workers > 1 else ""
+    announce(
+        f"rendering {'the remaining ' * is_resumed}{n} images of '{spec.variant}' into {folder.root}, once, with "
+        f"{workers} process{many}; the time left follows the first images; stop at any time, the same command resumes"
+    )
     begun = time.monotonic()
-    title = spec.variant if shard is None else f"{spec.variant} {shard}"
-    with ExitStack() as stack:
-        journals = {split: stack.enter_context(open_journal(folder.journal_path(split, shard))) for split in SPLITS}
-        shown = shown_progress(
-            len(samples), f"rendering {title}", min(workers, len(samples)), f"fewer images: {fewer}"
-        )
-        advance = stack.enter_context(shown)
-        for record in stack.enter_context(closing(render_all(folder, spec, by_sky(spec, samples), workers))):
-            journals[record.split].write(record.model_dump_json() + "\n")
-            known[record.split][record.index] = record
-            advance()
+    try:
+        with shown_progress(n, f"rendering {spec.variant}", min(workers, n), f"fewer images: {fewer}") as advance:
+            for waits in (False, True):
+                elsewhere = []
+                with closing(render_all(folder, spec, by_sky(spec, samples), workers, waits=waits)) as made:
+                    for sample, is_there in made:
+                        advance() if is_there else elsewhere.append(sample)
+                samples = elsewhere
+                if samples:
+                    announce(f"{folder.root}: waiting for {len(samples)} images that other processes render")
+    except UserError:
+        if not (folder.manifest.splits or any(side_files(folder, split) for split in SPLITS)):
+            # the next command may have another specification
+            folder.manifest_path.unlink(missing_ok=True)
+        raise
     seconds = time.monotonic() - begun
-    announce(f"rendered {len(samples)} images in {duration(seconds)}, {len(samples) / seconds:.1f} a second")
+    announce(f"rendered {n} images in {duration(seconds)}, {n / seconds:.1f} a second")
 
 
 def render_all(
-    folder: DatasetFolder, spec: DatasetSpec, samples: Samples, workers: int
-) -> Generator[SampleRecord, None, None]:
-    """Render samples and yield each record as soon as its image is on disk.
+    folder: DatasetFolder, spec: DatasetSpec, samples: Sequence[Sample], workers: int, *, waits: bool = False
+) -> Generator[tuple[Sample, bool], None, None]:
+    """Make samples and yield each with whether it is on disk, or another process makes it; `waits` until it has.
 
-    Each worker renders one sample at a time and gets the next after the consumer has processed its last record, so
-    that a kill loses at most one sample per worker. If the consumer stops early or a worker fails, no further sample
-    begins, the samples in progress are finished, and all processes end before the error is raised.
+    Each worker makes one sample at a time. If the consumer stops early or a worker fails, no further sample begins,
+    the samples in progress are finished, and all processes end before the error is raised.
 
     Raises RenderError if a worker failed or died.
     """
     log, todo = folder.cache / "render.log", iter(samples)
-    busy: dict[Connection, Child] = {}
+    busy: dict[Connection, tuple[Child, Sample]] = {}
     with ExitStack() as stack:
         for sample in islice(todo, workers):
             child = stack.enter_context(Child("phd_exp.rendering.worker", ONE_THREAD, log))
             child.send((folder, spec))
-            child.send(sample)
-            busy[child.connection] = child
+            child.send((*sample, waits))
+            busy[child.connection] = child, sample
         while busy:
             for connection in wait(list(busy)):
                 assert isinstance(connection, Connection)
+                child, sample = busy.pop(connection)
                 try:
-                    record = busy[connection].receive()
+                    is_there = child.receive()
                 except EOFError as death:
                     raise RenderError(
                         f"a render worker: {death}; finished images are kept, and the same command resumes "
                         f"(its last words: {log})"
                     ) from None
-                yield record
-                if (following := next(todo, None)) is None:
-                    del busy[connection]
-                else:
-                    busy[connection].send(following)
+                yield sample, is_there
+                if following := next(todo, None):
+                    child.send((*following, waits))
+                    busy[connection] = child, following
 
 
-def by_sky(spec: DatasetSpec, samples: Samples) -> Samples:
+def by_sky(spec: DatasetSpec, samples: Sequence[Sample]) -> Sequence[Sample]:
     """The samples in another order: of each TOGETHER in succession, those with the same sky follow each other.
 
     A worker needs longer to load another sky than for the rest of the scene.
@@ -219,7 +145,7 @@ def by_sky(spec: DatasetSpec, samples: Samples) -> Samples:
     if spec.mesh is None or spec.backdrops is None:
         return samples
 
-    def sky(sample: tuple[Split, int]) -> str:
+    def sky(sample: Sample) -> str:
         split, index = sample
         return surroundings_of(spec, split, index // spec.views)[0].file or ""
 
@@ -230,12 +156,3 @@ def by_sky(spec: DatasetSpec, samples: Samples) -> Samples:
 def worker_count(samples: int, cores: int | None = None) -> int:
     """Default number of processes: one per core that may be used, fewer for little work."""
     return max(1, min(cores or usable_cores(), math.ceil(samples / FEWEST_PER_WORKER)))
-
-
-def _first_words(folder: DatasetFolder, spec: DatasetSpec, n: int, workers: int, *, resumed: bool) -> str:
-    left = f"the remaining {n}" if resumed else f"{n}"
-    return (
-        f"rendering {left} images of '{spec.variant}' into {folder.root}, once, with {workers} "
-        f"process{'es' if workers > 1 else ''}; the time left follows the first images; "
-        "stop at any time, the same command resumes"
-    )

@@ -1,43 +1,51 @@
-"""From images and journals to a finished folder: the samples known so far, and the order in which it is sealed.
+"""From side files to a finished folder: its first manifest, the samples that are made, and the last writing.
 
-Each shard has a journal, and so has a render without shards. A render that resumes takes the samples of all journals
-as finished. Sealing removes the journals; it holds an exclusive lock, so that no other process is writing one.
+A sample is made when its image and then its side file, `.cache/rendered/<split>/000123.json` with its record, are on
+disk. Sealing turns the records into `metadata.jsonl`.
 """
 
-from contextlib import suppress
+import shutil
+from pathlib import Path
 
-from phd_exp.records.dataset import SPLITS, DatasetFolder, Manifest, Seal, sha256
-from phd_exp.records.errors import CorruptFileError, DatasetError, UserError
+from phd_exp.records.dataset import SPLITS, DatasetFolder, Manifest, Seal, image_name, sha256
+from phd_exp.records.errors import CorruptFileError, DatasetError
 from phd_exp.records.files import read_jsonl, remove_temporaries, write_atomic
+from phd_exp.records.processes import announce, held
 from phd_exp.records.scenes import SampleRecord, Split
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.blender import renderer_version
-from phd_exp.rendering.masks import DRAW, ensure_drawn
+from phd_exp.rendering.masks import DRAW
 from phd_exp.rendering.sampling import generator_version
 
-Wanted = dict[Split, int]
-Known = dict[Split, dict[int, SampleRecord]]
+Sample = tuple[Split, int]
+"""Split and index of a sample."""
 
 
 def begin(folder: DatasetFolder, spec: DatasetSpec) -> None:
     """Write the manifest, which names the data set, before the first image, unless there is one.
 
     Raises:
-        DatasetError: another generator or another Blender made the folder, whose samples would not match the rest.
+        DatasetError: the folder holds another data set, or another generator or Blender made it, whose samples would
+            not match the rest.
     """
-    for split in SPLITS:
-        folder.split_folder(split).mkdir(exist_ok=True)
-    if not folder.manifest_path.exists():
-        for name in DRAW:  # of another data set that was here
-            for file in (folder.root / name, (folder.root / name).with_suffix(".json")):
-                file.unlink(missing_ok=True)
-        manifest = Manifest(generator=generator_version(spec), renderer=renderer_version(), spec=spec, splits={})
-        folder.write_manifest(manifest)
-    for key, theirs, ours in other_make(folder.manifest):
-        raise DatasetError(
-            f"{folder.root}: begun with {key} {theirs}, this is {ours}, and the rest would not match; "
-            "move the folder away or choose another data.root"
-        )
+    with held(folder.render_lock, waiting=f"{folder.root}: waiting for the manifest"):
+        for split in SPLITS:
+            folder.split_folder(split).mkdir(exist_ok=True)
+        if not folder.manifest_path.exists():
+            for name in DRAW:  # of another data set that was here
+                for file in (folder.root / name, (folder.root / name).with_suffix(".json")):
+                    file.unlink(missing_ok=True)
+            shutil.rmtree(folder.cache / "rendered", ignore_errors=True)
+            folder.write_manifest(
+                Manifest(generator=generator_version(spec), renderer=renderer_version(), spec=spec, splits={})
+            )
+        for split in SPLITS:
+            side_file(folder, split, 0).parent.mkdir(parents=True, exist_ok=True)
+        for key, theirs, ours in other_make(folder.require(spec)):
+            raise DatasetError(
+                f"{folder.root}: begun with {key} {theirs}, this is {ours}, and the rest would not match; "
+                "move the folder away or choose another data.root"
+            )
 
 
 def other_make(manifest: Manifest) -> list[tuple[str, int | str, int | str]]:
@@ -47,56 +55,67 @@ def other_make(manifest: Manifest) -> list[tuple[str, int | str, int | str]]:
     return [(key, theirs, ours) for key, theirs, ours in made if theirs != ours]
 
 
-def known_samples(folder: DatasetFolder) -> Known:
-    """Records of the samples whose image is on disk, from the sealed files and from all journals."""
-    return {split: _known_of(folder, split) for split in SPLITS}
+def side_file(folder: DatasetFolder, split: Split, index: int) -> Path:
+    """The record of a sample, until the data set is sealed."""
+    return folder.cache / "rendered" / split / f"{index:06d}.json"
 
 
-def _known_of(folder: DatasetFolder, split: Split) -> dict[int, SampleRecord]:
-    # in the order in which sealing moves records, so that none is missed while another process seals
-    plain = folder.journal_path(split)
-    records: list[SampleRecord] = []
-    for path in (*(set(folder.journals(split)) - {plain}), plain, folder.metadata_path(split)):
-        try:
-            with suppress(FileNotFoundError):
-                records += read_jsonl(path, SampleRecord.model_validate_json)
-        except CorruptFileError as error:
-            raise DatasetError(f"{error}; remove that line, and its image is rendered again") from error
-    images = folder.images(split)
-    # reversed: a journal is newer than the sealed file
-    return {record.index: record for record in reversed(records) if record.file_name in images}
+def side_files(folder: DatasetFolder, split: Split) -> list[Path]:
+    """Those on disk."""
+    return list(side_file(folder, split, 0).parent.glob("*.json"))
 
 
-def missing(known: Known, wanted: Wanted) -> list[tuple[Split, int]]:
-    """Split and index of each wanted sample that is not known."""
-    return [(split, index) for split in SPLITS for index in range(wanted[split]) if index not in known[split]]
+def unmade(folder: DatasetFolder, spec: DatasetSpec, n_train: int, n_test: int) -> list[Sample]:
+    """The wanted samples that are neither sealed nor made."""
+    left: list[Sample] = []
+    for split, indices in folder.missing(spec, n_train, n_test).items():
+        images, sides = folder.images(split), {path.stem for path in side_files(folder, split)}
+        is_made = (f"{i:06d}" in sides and image_name(i, spec.image_format) in images for i in indices)
+        left += [(split, index) for index, made in zip(indices, is_made, strict=True) if not made]
+    return left
 
 
-def seal(folder: DatasetFolder, spec: DatasetSpec, known: Known) -> None:
-    """Write `metadata.jsonl`, remove the journals, count the samples in the manifest, and draw masks, in this order.
+def seal(folder: DatasetFolder, spec: DatasetSpec, n_train: int, n_test: int) -> bool:
+    """Write `metadata.jsonl` and then the manifest, and remove the side files; returns whether all samples are there.
 
-    The caller holds `render.lock` exclusively.
+    If some are not made, the folder stays as it is. One process seals at a time; the others find the folder sealed.
     """
-    seals = {split: done for split in SPLITS if (done := _seal_split(folder, split, known[split])).n}
-    remove_temporaries(folder.root)
-    folder.write_manifest(folder.manifest.model_copy(update={"splits": seals}))
-    with suppress(UserError):  # a training that needs masks reports that they are missing
-        ensure_drawn(folder, spec, folder.manifest.count("train"))
+    with held(folder.render_lock, waiting=f"{folder.root}: another process writes the metadata"):
+        if not any(folder.missing(spec, n_train, n_test).values()):
+            return True
+        if left := unmade(folder, spec, n_train, n_test):
+            announce(f"{folder.root}: {len(left)} samples of other shards are missing")
+            return False
+        seals = {split: done for split in SPLITS if (done := _seal_split(folder, split)).n}
+        remove_temporaries(folder.root)
+        folder.write_manifest(folder.manifest.model_copy(update={"splits": seals}))
+        for split, done in seals.items():
+            for path in side_files(folder, split):
+                if int(path.stem) < done.n:
+                    path.unlink()
+    return True
 
 
-def _seal_split(folder: DatasetFolder, split: Split, known: dict[int, SampleRecord]) -> Seal:
-    """Turn the samples up to the first gap into `metadata.jsonl`; those beyond it stay in the plain journal."""
+def _seal_split(folder: DatasetFolder, split: Split) -> Seal:
+    """Write the records of the samples up to the first gap."""
+    known = _records(folder, split)
     n = next(index for index in range(len(known) + 1) if index not in known)
-    lines, beyond = (
-        "".join(known[index].model_dump_json() + "\n" for index in indices)
-        for indices in (range(n), sorted(index for index in known if index > n))
-    )
-    plain = folder.journal_path(split)
-    for path, text in ((folder.metadata_path(split), lines), (plain, beyond)):
-        if text:
-            write_atomic(path, text)
-    for journal in folder.journals(split):
-        if not beyond or journal != plain:
-            journal.unlink()
+    lines = "".join(known[index].model_dump_json() + "\n" for index in range(n))
+    if lines:
+        write_atomic(folder.metadata_path(split), lines)
+    for path in folder.split_folder(split).glob("metadata.partial*.jsonl"):  # of earlier versions
+        path.unlink()
     remove_temporaries(folder.split_folder(split))
     return Seal(n=n, metadata_sha256=sha256(lines.encode()))
+
+
+def _records(folder: DatasetFolder, split: Split) -> dict[int, SampleRecord]:
+    """The sealed records and those of side files, which are newer, of the samples whose images are there."""
+    records = folder.records(split) if folder.metadata_path(split).exists() else []
+    for path in side_files(folder, split):
+        try:
+            records += read_jsonl(path, SampleRecord.model_validate_json)
+        except CorruptFileError as error:
+            raise DatasetError(f"{error}; delete the file, and its image is rendered again") from error
+    images = folder.images(split)
+    return {record.index: record for record in records if record.file_name in images}

@@ -24,6 +24,7 @@ from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.render import render_all, worker_count
 from phd_exp.rendering.sampling import GENERATOR_VERSION
+from phd_exp.rendering.sealing import begin
 
 pytestmark = [pytest.mark.bench, pytest.mark.timeout(7200)]
 
@@ -80,8 +81,8 @@ def psnr(path: Path, reference: Path) -> float:
 def our_images_a_second(spec: DatasetSpec, folder: DatasetFolder) -> float:
     """Of the whole machine, as `render` uses it, once the workers have begun."""
     n = BURST["ours"]
-    for path in (folder.cache, folder.split_folder("test")):
-        path.mkdir(parents=True, exist_ok=True)
+    folder.cache.mkdir(parents=True, exist_ok=True)
+    begin(folder, spec)
     tasks = [("test", index) for index in range(n)]
     times = [time.perf_counter() for _ in render_all(folder, spec, tasks, worker_count(n))]
     return (n - 1) / (times[-1] - times[0])

@@ -64,7 +64,7 @@ WRONG_VALUES = [
     (["+data.folder=photos"], ["data.folder: unknown key", "expected one of", "sensor_size"]),
     ([*FOLDER, "data.name=../x"], ["data.name", "'../x'"]),
     (["render", "data=folder"], [NOTHING_TO_RENDER]),
-    (["render", "shard=4/4"], ["shard: got '4/4'; expected INDEX/COUNT with 0 <= INDEX < COUNT, from 0/4 to 3/4"]),
+    (["render", "shard=4/4"], ["shard: got '4/4'; expected INDEX/COUNT with 0 <= INDEX < COUNT, such as 0/4"]),
     (["render", "+shards=0/2"], ["shards: unknown key"]),
     (["render", "masks=true"], ["masks: got True; expected the name of a folder"]),
 ]

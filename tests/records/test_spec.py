@@ -157,7 +157,6 @@ def test_shares_are_a_partition_of_equal_sizes(count: int) -> None:
     assert max(sizes) - min(sizes) <= 1
     for index in range(20):
         assert sum(shard.holds(index) for shard in shards) == 1
-    assert [str(shard) for shard in shards] == [f"{index}/{count}" for index in range(count)]
 
 
 @pytest.mark.parametrize("text", ["4/4", "-1/2", "1/0", "0/0", "a", "1", "", "1/2/3", " 1/2", 1, 0.5, None])

@@ -1,56 +1,161 @@
-"""A folder ends with the same bytes whatever the workers, the order, and the interruptions."""
+"""A folder ends with the same bytes whatever the workers, the order, the shares and the interruptions."""
 
 import os
+from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
 
-from phd_exp.records.dataset import DatasetFolder, sha256
+from phd_exp.records.dataset import SPLITS, DatasetFolder, sha256
 from phd_exp.records.errors import DatasetError, RenderError
+from phd_exp.records.files import read_jsonl
 from phd_exp.records.processes import Child
-from phd_exp.records.scenes import Split
-from phd_exp.records.spec import DatasetSpec
-from phd_exp.rendering import blender
+from phd_exp.records.spec import DatasetSpec, Shard
+from phd_exp.rendering import blender, render, sealing
 from phd_exp.rendering.render import ONE_THREAD, ensure_rendered, render_all, worker_count
-from tests.support.renders import contents
+from phd_exp.rendering.sealing import Sample, begin, seal, side_file, side_files, unmade
+from tests.support.renders import N_TEST, N_TRAIN, contents, made, rendering_elsewhere, unsealed, wait_until
+
+ALL = (N_TRAIN, N_TEST)
+FIRST, SECOND = Shard(0, 2), Shard(1, 2)
+
+
+@pytest.fixture
+def begun(folder: DatasetFolder, small_spec: DatasetSpec) -> DatasetFolder:
+    """A folder with a manifest and no samples."""
+    folder.cache.mkdir(parents=True)
+    begin(folder, small_spec)
+    return folder
 
 
 def test_the_manifest_and_the_records_fit_the_files(small: DatasetFolder, small_spec: DatasetSpec) -> None:
     assert small.manifest.spec == small_spec
-    counts: dict[Split, int] = {"train": 12, "test": 4}
-    for split, n in counts.items():
+    for split, n in zip(SPLITS, ALL, strict=True):
         assert small.manifest.splits[split].n == n
         assert small.manifest.splits[split].metadata_sha256 == sha256(small.metadata_path(split).read_bytes())
-        records = small.records(split)
-        assert len(records) == n
-        for record in records:
+        for record in small.records(split):
             assert record.sha256 == sha256(small.image_path(split, record.index).read_bytes())
-    assert len({record.sha256 for split in counts for record in small.records(split)}) == 16
+        assert not side_files(small, split)
+    assert len({record.sha256 for split in SPLITS for record in small.records(split)}) == sum(ALL)
 
 
 def test_a_sample_is_the_same_alone_and_in_another_order(
+    begun: DatasetFolder, small: DatasetFolder, small_spec: DatasetSpec
+) -> None:
+    order: list[Sample] = [("train", 7), ("test", 2), ("train", 3), ("train", 0)]
+    assert list(render_all(begun, small_spec, order, workers=1)) == [(sample, True) for sample in order]
+    for split, index in order:
+        assert read_jsonl(side_file(begun, split, index)) == read_jsonl(small.metadata_path(split))[index : index + 1]
+
+
+WAYS: dict[str, list[tuple[Shard | None, int, int]]] = {
+    "more and more": [(None, 3, 1), (None, *ALL), (None, 2, 1)],
+    "shares in another order": [(Shard(2, 3), *ALL), (Shard(0, 3), *ALL), (Shard(1, 3), *ALL)],
+    "shares of other counts": [(SECOND, *ALL), (Shard(1, 4), *ALL), (FIRST, 6, 2), (None, *ALL)],
+}
+
+
+@pytest.mark.parametrize("way", WAYS.values(), ids=WAYS)
+def test_each_sample_is_rendered_once_in_any_way(
+    folder: DatasetFolder, small: DatasetFolder, small_spec: DatasetSpec, copied: None,
+    capfd: pytest.CaptureFixture[str], way: list[tuple[Shard | None, int, int]],
+) -> None:  # fmt: skip
+    """Nothing counts as finished before all that was asked for is there."""
+    for shard, *wanted in way:
+        is_whole = ensure_rendered(folder, small_spec, *wanted, shard=shard)
+        assert is_whole == (not any(folder.missing(small_spec, *wanted).values()))
+        assert is_whole or folder.manifest.count("train") == 0
+    assert contents(folder) == contents(small)
+    assert capfd.readouterr().err.count("copied") == sum(ALL)
+
+
+def test_several_processes_share_an_empty_folder(
     folder: DatasetFolder, small: DatasetFolder, small_spec: DatasetSpec
 ) -> None:
-    folder.root.mkdir()
-    for path in (folder.cache, folder.split_folder("train"), folder.split_folder("test")):
-        path.mkdir()
-    order: list[tuple[Split, int]] = [("train", 7), ("test", 2), ("train", 3), ("train", 0)]
-    for record in render_all(folder, small_spec, order, workers=1):
-        assert record == small.records(record.split)[record.index]
+    with ExitStack() as stack:
+        racing = [
+            stack.enter_context(rendering_elsewhere(folder, small_spec, shard=shard, source=small))
+            for shard in (None, None, FIRST, SECOND)
+        ]
+        said = [process.communicate()[1] for process in racing]
+        assert [process.returncode for process in racing] == [0] * 4, said
+    assert contents(folder) == contents(small)
+    assert sum(text.count("copied") for text in said) == sum(ALL), "each image is rendered once"
+
+
+def test_a_process_waits_for_the_images_of_others(
+    folder: DatasetFolder, small: DatasetFolder, small_spec: DatasetSpec, copied: None,
+    capfd: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    with rendering_elsewhere(folder, small_spec, source=small, seconds=0.5) as process:
+        wait_until(lambda: made(folder))
+        ensure_rendered(folder, small_spec, *ALL)
+        assert contents(folder) == contents(small)
+        process.communicate()
+        assert process.returncode == 0
+    assert "waiting for 1 images that other processes render" in capfd.readouterr().err
+    assert contents(folder) == contents(small)
+
+
+@pytest.mark.parametrize("survived", range(4))
+def test_a_kill_while_sealing_loses_nothing(
+    folder: DatasetFolder, small: DatasetFolder, small_spec: DatasetSpec, copied: None,
+    monkeypatch: pytest.MonkeyPatch, survived: int,
+) -> None:  # fmt: skip
+    """At each of its writes in turn: two metadata files, the manifest, and the removal of side files."""
+    ensure_rendered(folder, small_spec, *ALL)
+    unsealed(folder)
+    writes = iter(range(9))
+
+    def dying(original: Callable[..., None]) -> Callable[..., None]:
+        def write(*arguments: object) -> None:
+            if next(writes) == survived:
+                raise KeyboardInterrupt
+            original(*arguments)
+
+        return write
+
+    with monkeypatch.context() as patched:
+        patched.setattr(sealing, "write_atomic", dying(sealing.write_atomic))
+        patched.setattr(DatasetFolder, "write_manifest", dying(DatasetFolder.write_manifest))
+        patched.setattr(Path, "unlink", dying(Path.unlink))
+        with pytest.raises(KeyboardInterrupt):
+            seal(folder, small_spec, *ALL)
+    assert unmade(folder, small_spec, *ALL) == []
+    monkeypatch.setattr(render, "render_all", None)
+    assert ensure_rendered(folder, small_spec, *ALL)
+    assert contents(folder) == contents(small)
+
+
+def test_a_lost_image_and_a_broken_record_are_rendered_again(
+    folder: DatasetFolder, small: DatasetFolder, small_spec: DatasetSpec, copied: None
+) -> None:
+    ensure_rendered(folder, small_spec, *ALL)
+    folder.image_path("train", 2).unlink()
+    ensure_rendered(folder, small_spec, *ALL)
+    assert contents(folder) == contents(small)
+    unsealed(folder)
+    side_file(folder, "train", 1).write_text("{}\n")
+    with pytest.raises(DatasetError, match=r"000001\.json, line 1: .*; delete the file, and its image is rendered"):
+        ensure_rendered(folder, small_spec, *ALL)
+    side_file(folder, "train", 1).unlink()
+    (folder.split_folder("train") / "metadata.partial.jsonl").touch()  # of an earlier version
+    ensure_rendered(folder, small_spec, *ALL)
+    assert contents(folder) == contents(small)
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="this system binds no process to cores")
-def test_a_worker_has_as_many_threads_on_many_cores_as_on_one(folder: DatasetFolder, small_spec: DatasetSpec) -> None:
-    folder.split_folder("train").mkdir(parents=True)
+def test_a_worker_has_as_many_threads_on_many_cores_as_on_one(begun: DatasetFolder, small_spec: DatasetSpec) -> None:
     cores, threads = os.sched_getaffinity(0), []
-    for some in (cores, {min(cores)}):
+    for number, some in enumerate((cores, {min(cores)})):
         os.sched_setaffinity(0, some)  # a worker inherits it
         try:
             with Child("phd_exp.rendering.worker", ONE_THREAD) as worker:
-                worker.send((folder, small_spec))
+                worker.send((begun, small_spec))
                 for index in range(2):
-                    worker.send(("train", index))
+                    worker.send(("train", 2 * number + index, False))
                     worker.receive()
                 threads.append(len(os.listdir(f"/proc/{worker.process.pid}/task")))
         finally:
@@ -58,60 +163,51 @@ def test_a_worker_has_as_many_threads_on_many_cores_as_on_one(folder: DatasetFol
     assert threads[0] == threads[1]
 
 
-def test_a_folder_grows_and_keeps_what_it_has(
-    folder: DatasetFolder,
-    small: DatasetFolder,
-    small_spec: DatasetSpec,
-    copied: None,
-    capfd: pytest.CaptureFixture[str],
-) -> None:
-    ensure_rendered(folder, small_spec, n_train=3, n_test=1)
-    assert folder.manifest.splits["train"].n == 3
-    first = folder.image_path("train", 0).stat().st_mtime_ns
-    assert "rendering 4 images" in capfd.readouterr().err
-    ensure_rendered(folder, small_spec, n_train=12, n_test=4)
-    assert "rendering the remaining 12 images" in capfd.readouterr().err
-    assert folder.image_path("train", 0).stat().st_mtime_ns == first
-    ensure_rendered(folder, small_spec, n_train=2, n_test=1)
-    assert contents(folder) == contents(small), "asking for less takes nothing away"
-    assert capfd.readouterr() == ("", "")
-
-
 def test_nothing_is_loaded_when_nothing_is_missing(
     small: DatasetFolder, small_spec: DatasetSpec, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A rendered folder is of use on machines without Blender."""
     monkeypatch.setattr(blender.importlib.util, "find_spec", lambda _: None)
-    ensure_rendered(small, small_spec, n_train=12, n_test=4)
+    ensure_rendered(small, small_spec, *ALL)
 
 
-def test_a_missing_bpy_is_one_line(
+def test_a_missing_bpy_or_a_library_of_it_is_one_line(
     folder: DatasetFolder, small_spec: DatasetSpec, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(blender.importlib.util, "find_spec", lambda _: None)
-    with pytest.raises(RenderError, match=r"bpy.* not installed: pip install 'phd_exp\[render\]'") as error:
-        ensure_rendered(folder, small_spec, 1, 1)
-    assert "\n" not in str(error.value)
-    assert not folder.root.exists()
-
-
-def test_a_missing_library_of_bpy_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     def broken(_: str) -> None:
         raise ImportError("libXi.so.6: cannot open shared object file")
 
+    monkeypatch.setattr(blender.importlib.util, "find_spec", lambda _: None)
+    with pytest.raises(RenderError, match=r"^bpy.* not installed: pip install 'phd_exp\[render\]'[^\n]*$|^rendering"):
+        ensure_rendered(folder, small_spec, 1, 1)
+    assert not folder.root.exists()
     monkeypatch.setattr(blender.importlib.util, "find_spec", lambda _: object())
     monkeypatch.setattr(blender.importlib, "import_module", broken)
     with pytest.raises(RenderError, match=r"libXi\.so\.6.*apt-get install .*libxi6"):
         blender.load_bpy()
 
 
-@pytest.mark.parametrize(("key", "value"), [("generator", 0), ("renderer", "bpy 4.2.0")])
-def test_a_folder_of_another_make_is_not_continued(
-    folder: DatasetFolder, small: DatasetFolder, small_spec: DatasetSpec, key: str, value: object
-) -> None:
-    folder.root.mkdir()
-    folder.write_manifest(small.manifest.model_copy(update={key: value, "splits": {}}))
-    with pytest.raises(DatasetError, match=f"begun with {key} {value}, this is .*; move the folder"):
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"generator": 0}, "begun with generator 0, this is .*; move the folder"),
+        ({"renderer": "bpy 4.2.0"}, "begun with renderer bpy 4.2.0, this is .*; move the folder"),
+        ({"seed": 7}, "seed=7, but seed=0 is asked for"),
+    ],
+)
+def test_another_data_set_or_make_is_not_continued(
+    folder: DatasetFolder, small: DatasetFolder, small_spec: DatasetSpec, monkeypatch: pytest.MonkeyPatch,
+    change: dict[str, object], message: str,
+) -> None:  # fmt: skip
+    """Also if another process begins it at the last moment."""
+    of_spec = {"spec": small_spec.model_copy(update=change)} if "seed" in change else change
+
+    def begin_another() -> None:
+        folder.root.mkdir()
+        folder.write_manifest(small.manifest.model_copy(update={"splits": {}} | of_spec))
+
+    monkeypatch.setattr(render, "require_bpy", begin_another)
+    with pytest.raises(DatasetError, match=message):
         ensure_rendered(folder, small_spec, n_train=1, n_test=0)
 
 
@@ -127,14 +223,10 @@ def test_an_image_that_cannot_be_written_is_one_line(
     with pytest.raises(RenderError, match=r"000001\.png.*: cannot be written") as error:
         ensure_rendered(folder, small_spec, n_train=2, n_test=0, workers=1)
     assert "\n" not in str(error.value)
-    assert sorted(path.name for path in folder.split_folder("train").iterdir()) == [
-        "000000.png",
-        "000001.png",
-        "metadata.partial.jsonl",
-    ]
+    assert sorted(path.name for path in folder.split_folder("train").iterdir()) == ["000000.png", "000001.png"]
 
 
 def test_few_samples_take_few_workers(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("phd_exp.rendering.render.usable_cores", lambda: 16)
+    monkeypatch.setattr(render, "usable_cores", lambda: 16)
     assert [worker_count(tasks) for tasks in (1, 8, 9, 64, 10_000)] == [1, 1, 2, 8, 16]
     assert [worker_count(tasks, cores=4) for tasks in (1, 9, 10_000)] == [1, 2, 4]

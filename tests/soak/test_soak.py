@@ -17,6 +17,7 @@ import pytest
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.processes import Child
 from phd_exp.records.spec import DatasetSpec
+from phd_exp.rendering.sealing import begin
 from tests.e2e.conftest import QUICK
 from tests.soak.soaker import memory
 
@@ -52,12 +53,13 @@ def test_a_process_that_trains_and_renders_for_long_neither_grows_nor_leaves_any
 def test_a_render_worker_does_not_grow(tmp_path: Path, make_spec: Callable[..., DatasetSpec]) -> None:
     spec = make_spec("occl_scale", sensor_size=64, f_range=(343.0, 571.0))
     folder = DatasetFolder(tmp_path / "occl_scale")
-    folder.split_folder("train").mkdir(parents=True)
+    folder.cache.mkdir(parents=True)
+    begin(folder, spec)
     with Child("phd_exp.rendering.worker", log=tmp_path / "render.log") as worker:
         worker.send((folder, spec))
         kilobytes, handles = [], []
         for index in range(IMAGES):
-            worker.send(("train", index))
+            worker.send(("train", index, False))
             worker.receive()
             if index in (IMAGES // 10, IMAGES - 1):
                 kilobytes.append(memory(worker.process.pid))

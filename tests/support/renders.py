@@ -1,6 +1,7 @@
 """Helpers of the tests that render: contents of a folder, waiting, and a render in a separate process."""
 
 import io
+import json
 import subprocess
 import sys
 import time
@@ -13,12 +14,13 @@ import numpy as np
 from PIL import Image
 
 from phd_exp.records.dataset import SPLITS, DatasetFolder
-from phd_exp.records.files import read_jsonl, write_atomic
 from phd_exp.records.scenes import SampleRecord, Scene, SceneObject, Split
 from phd_exp.records.spec import DatasetSpec, Shard
 from phd_exp.rendering.objects import sample_object_scene
 from phd_exp.rendering.rays import NOTHING, Hits, Mask
+from phd_exp.rendering.sealing import side_file, side_files
 from phd_exp.rendering.triangles import Meshes
+from phd_exp.rendering.worker import make
 
 MakeSpec = Callable[..., DatasetSpec]
 """The fixture `make_spec`."""
@@ -44,24 +46,22 @@ def written(folder: DatasetFolder) -> dict[Path, int]:
     return {path: path.stat().st_mtime_ns for path in folder.root.rglob("*.png")}
 
 
-def journaled(folder: DatasetFolder) -> dict[Path, int]:
-    """The images with a line in a journal, each of which is whole, and when they were written, ns."""
-    names = [
-        folder.split_folder(split) / line["file_name"]
-        for split in SPLITS
-        for journal in folder.journals(split)
-        for line in read_jsonl(journal)
-    ]
-    for path in names:
+def made(folder: DatasetFolder) -> dict[Path, int]:
+    """The images with a side file, each of which is whole, and when they were written, ns."""
+    sides = [(split, path) for split in SPLITS for path in side_files(folder, split)]
+    images = [folder.split_folder(split) / json.loads(path.read_bytes())["file_name"] for split, path in sides]
+    for path in images:
         decoded(path.read_bytes())
-    return {path: path.stat().st_mtime_ns for path in names}
+    return {path: path.stat().st_mtime_ns for path in images}
 
 
 def unsealed(folder: DatasetFolder) -> None:
-    """As a kill just before the end leaves a folder: all images, and all lines in the journals."""
+    """As a kill just before the end leaves a folder: all images, and all side files."""
     for split in SPLITS:
-        if folder.metadata_path(split).exists():
-            folder.metadata_path(split).rename(folder.journal_path(split))
+        for record in folder.records(split):
+            side_file(folder, split, record.index).write_text(record.model_dump_json() + "\n")
+    for split in SPLITS:
+        folder.metadata_path(split).unlink(missing_ok=True)
     folder.write_manifest(folder.manifest.model_copy(update={"splits": {}}))
 
 
@@ -86,17 +86,20 @@ def wait_until(condition: Callable[[], object]) -> None:
         time.sleep(0.005)
 
 
-def copying(source: DatasetFolder, seconds: float = 0.0) -> Callable[..., Iterator[SampleRecord]]:
+def copying(source: DatasetFolder, seconds: float = 0.0) -> Callable[..., Iterator[tuple[tuple[Split, int], bool]]]:
     """`render_all` whose images are copies, each after a pause: for laws of what is rendered when."""
     records = {split: source.records(split) for split in SPLITS}
 
+    def paint(split: Split, index: int) -> tuple[bytes, SampleRecord]:
+        time.sleep(seconds)
+        print("copied", split, index, file=sys.stderr)
+        return source.image_path(split, index).read_bytes(), records[split][index]
+
     def render_all(
-        folder: DatasetFolder, spec: DatasetSpec, samples: Sequence[tuple[Split, int]], workers: int
-    ) -> Iterator[SampleRecord]:
+        folder: DatasetFolder, spec: DatasetSpec, samples: Sequence[tuple[Split, int]], workers: int, *, waits: bool
+    ) -> Iterator[tuple[tuple[Split, int], bool]]:
         for split, index in samples:
-            time.sleep(seconds)
-            write_atomic(folder.image_path(split, index), source.image_path(split, index).read_bytes())
-            yield records[split][index]
+            yield (split, index), make(folder, spec, split, index, paint, waits=waits)
 
     return render_all
 
@@ -109,12 +112,13 @@ def rendering_elsewhere(
     n: tuple[int, int] = (N_TRAIN, N_TEST),
     shard: Shard | None = None,
     source: DatasetFolder | None = None,
+    seconds: float = 0.03,
 ) -> Iterator[subprocess.Popen[str]]:
     """`ensure_rendered` in its own process group, which is killed at the end.
 
     With a `source`, its images are copied, slowly.
     """
-    stand_in = f"render.render_all = copying(DatasetFolder({str(source.root)!r}), 0.03)" if source else ""
+    stand_in = f"render.render_all = copying(DatasetFolder({str(source.root)!r}), {seconds})" if source else ""
     script = (
         # a shell makes background processes ignore interrupts, and this process would inherit that
         "import signal\n"
