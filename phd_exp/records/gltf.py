@@ -1,19 +1,11 @@
 """The documents of glTF: read, written, and reduced to the default scene at rest."""
 
-import base64
 import json
 import re
 import struct
-from pathlib import Path
 from typing import Any
-from urllib.parse import unquote
-
-import numpy as np
-from numpy.typing import NDArray
 
 from phd_exp.records.parsing import parse_json
-
-FLOATS = 5126  # a type of components
 
 
 def split_gltf(content: bytes) -> tuple[Any, bytes]:
@@ -58,24 +50,3 @@ def keep_default_scene_at_rest(document: Any) -> None:
     document.pop("animations", None)
     required = document.get("extensionsRequired", ())
     document["extensionsRequired"] = [name for name in required if not re.search("visibility|texture", name)]
-
-
-def positions(document: Any, rest: bytes) -> list[NDArray[np.float32]]:
-    """Coordinates (n, 3) of vertices, except those that are whole numbers or compressed."""
-    parts = [part["attributes"] for mesh in document.get("meshes", ()) for part in mesh["primitives"]]
-    accessors = [document["accessors"][part["POSITION"]] for part in parts if "POSITION" in part]
-    result: list[NDArray[np.float32]] = []
-    for accessor in accessors:
-        if accessor["componentType"] == FLOATS and "bufferView" in accessor:
-            view = document["bufferViews"][accessor["bufferView"]]
-            buffer = _bytes_of(document["buffers"][view["buffer"]].get("uri"), rest)
-            start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
-            result.append(np.ndarray((accessor["count"], 3), "<f4", buffer, start, (view.get("byteStride", 12), 4)))
-    return result
-
-
-def _bytes_of(uri: str | None, rest: bytes) -> bytes:
-    """The content of a buffer, which is the second chunk of a .glb, a part of the document, or a file."""
-    if uri is None:
-        return rest[8:]
-    return base64.b64decode(uri.partition(",")[2]) if uri.startswith("data:") else Path(unquote(uri)).read_bytes()

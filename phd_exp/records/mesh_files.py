@@ -12,7 +12,7 @@ from urllib.parse import quote, unquote
 import numpy as np
 from numpy.typing import NDArray
 
-from phd_exp.records.gltf import joined_gltf, keep_default_scene_at_rest, positions, split_gltf
+from phd_exp.records.gltf import joined_gltf, keep_default_scene_at_rest, split_gltf
 
 MATERIALS = "materials.mtl"  # which the copy of an OBJ names
 _BOM = b"\xef\xbb\xbf"
@@ -45,7 +45,7 @@ class MeshFile:
         files: the files that it names.
         lost: why parts of its look cannot be drawn.
         has_colours: whether a vertex of an OBJ has a colour.
-        coordinates: returns those of its vertices as arrays (n, 3), unless they are compressed.
+        coordinates: returns those of its vertices (n, 3); none for glTF, whose bounds Blender checks.
     """
 
     path: Path
@@ -55,7 +55,7 @@ class MeshFile:
     files: list[Path] = field(default_factory=list)
     lost: list[str] = field(default_factory=list)
     has_colours: Callable[[], bool] = bool
-    coordinates: Callable[[], list[NDArray[Any]]] = list
+    coordinates: Callable[[], NDArray[Any]] = lambda: np.empty((0, 3))
 
     def find(self, name: str, folder: Path) -> Path | None:
         """The file that a text in `folder` names, perhaps with Windows' separators or a place on another machine."""
@@ -77,13 +77,11 @@ class MeshFile:
 
     def require_finite(self) -> None:
         """Raise ValueError unless all coordinates are finite 32-bit numbers; Blender reads others as 0."""
-        for points in _of_stranger(self.coordinates, self.path):
-            with np.errstate(over="ignore"):
-                wrong = np.flatnonzero(~np.isfinite(points.astype(np.float32)).all(axis=1))
-            if len(wrong):
-                raise ValueError(
-                    f"vertex {wrong[0] + 1} is at {points[wrong[0]].tolist()}; expected finite coordinates"
-                )
+        points = _of_stranger(self.coordinates, self.path)
+        with np.errstate(over="ignore"):
+            wrong = np.flatnonzero(~np.isfinite(points.astype(np.float32)).all(axis=1))
+        if len(wrong):
+            raise ValueError(f"vertex {wrong[0] + 1} is at {points[wrong[0]].tolist()}; expected finite coordinates")
 
 
 def read_mesh(path: Path) -> MeshFile:
@@ -123,7 +121,6 @@ def _read_gltf(mesh: MeshFile) -> None:
             mesh.lost.append(f"a texture has no image of a known kind ({', '.join(kinds)})")
     keep_default_scene_at_rest(document)
     mesh.copy = joined_gltf(document, rest, is_binary=mesh.copy.startswith(b"glTF"))
-    mesh.coordinates = lambda: positions(document, rest)
 
 
 def _read_obj(mesh: MeshFile) -> None:
@@ -146,7 +143,7 @@ def _read_obj(mesh: MeshFile) -> None:
     only = b"usemtl %b\n" % known.pop() if not used and len(known) == 1 else b""
     mesh.copy = b"mtllib %b\n" % MATERIALS.encode() + only + re.sub(rb"\n[ \t]*mtllib\b[^\n]*", b"", text)
     mesh.has_colours = lambda: bool(_OBJ_COLOUR.search(text))
-    mesh.coordinates = lambda: [_numbers(rb"v", text)]
+    mesh.coordinates = lambda: _numbers(rb"v", text)
 
 
 def _read_mtl(mesh: MeshFile, path: Path | None) -> bytes:
@@ -174,7 +171,7 @@ def _read_ply(mesh: MeshFile) -> None:
     if kinds.get(b"red", b"uchar") not in (b"uchar", b"uint8", b"float", b"float32", b"double", b"float64"):
         mesh.lost.append(f"colours of vertices are of type {kinds[b'red'].decode()}; expected uchar")
     if list(sections)[:1] == [b"vertex"] and b" list " not in vertex:
-        mesh.coordinates = lambda: [_rows(head, kinds, int(vertex.split()[2]), body[body.find(b"\n") + 1 :])]
+        mesh.coordinates = lambda: _rows(head, kinds, int(vertex.split()[2]), body[body.find(b"\n") + 1 :])
 
 
 def _rows(head: bytes, kinds: dict[bytes, bytes], n: int, body: bytes) -> NDArray[Any]:
@@ -193,9 +190,9 @@ def _read_stl(mesh: MeshFile) -> None:
         mesh.lost.append("colours of faces (COLOR=) are not read")
     n = int.from_bytes(mesh.copy[80:84], "little")
     if n and len(mesh.copy) == 84 + 50 * n:
-        mesh.coordinates = lambda: [np.ndarray((n, 9), "<f4", mesh.copy, 96, (50, 4)).reshape(-1, 3)]
+        mesh.coordinates = lambda: np.ndarray((n, 9), "<f4", mesh.copy, 96, (50, 4)).reshape(-1, 3)
     else:
-        mesh.coordinates = lambda: [_numbers(rb"vertex", mesh.copy)]
+        mesh.coordinates = lambda: _numbers(rb"vertex", mesh.copy)
 
 
 def _numbers(word: bytes, text: bytes) -> NDArray[Any]:

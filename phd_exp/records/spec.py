@@ -186,54 +186,11 @@ class DatasetSpec(Record):
         return self.camera is not None and self.view is None
 
     @model_validator(mode="after")
-    def _view_fits(self) -> "DatasetSpec":
-        if self.view == "box":
-            raise ValueError("view: got box; expected data.camera=FILE, or data.f, data.width and data.height")
-        if self.is_box and self.views > 1:
-            raise ValueError(f"views: got {self.views} with view=box; expected 1")
-        of_boxes = ("box_size", "box_shift", "edge_distance")
-        if not (self.is_box or all(map(self._is_usual, of_boxes))):
-            raise ValueError(f"{', '.join(of_boxes)}: got view=field; expected view=box")
-        has_front = self.front is not None and any(self.front)
-        if not (has_front or self._is_usual("front_range")):
-            raise ValueError("front: expected a direction [x, y, z] with front_range")
-        if len(given := [key for key in ("upright", "resting", "front") if getattr(self, key)]) > 1:
-            raise ValueError(f"{given[1]}: got also {given[0]}, another law of rotations; expected one of them")
-        return self
-
-    @model_validator(mode="after")
-    def _frames_fit(self) -> "DatasetSpec":
-        if self.frames > 1 and self.mesh is not None:
-            raise ValueError(f"frames: got {self.frames}; sequences are of the cylinder; expected 1")
-        motion = ("frame_rate", "speed", "spin_range", "camera_speed", "camera_turn")
-        if self.frames == 1 and (given := [key for key in motion if not self._is_usual(key)]):
-            raise ValueError(f"{given[0]}: nothing moves in single images; expected data=sequence")
-        return self
-
-    @model_validator(mode="after")
-    def _parts_fit(self) -> "DatasetSpec":
-        keys, n_others = list(type(self).model_fields), 3 + len(self.distractor_meshes)
-        if self.mesh is None and (given := set(keys[keys.index("unit") :]) & self.model_dump().keys()):
-            raise ValueError(f"{min(given)}: for meshes alone; expected data=object data.mesh=FILE")
-        if self.mesh is None and (near := NEAREST * SOLID * self.scale_range[1]) > self.z_range[0]:
-            raise ValueError(
-                f"z_range: got {list(self.z_range)}; expected at least {near:.3g} m, outside the objects"
-            )
-        if self.mesh is not None and self.occluders:
-            raise ValueError("occluders: for the cylinder alone; expected data.distractors=2")
-        if self.distractors > n_others or (self.distractors and self.views > 1):
-            raise ValueError(f"distractors: got {self.distractors}; expected at most {n_others}, and 0 if views > 1")
-        if self.copies and self.views > 1:
-            raise ValueError(f"copies: got {self.copies}; expected 0 if views > 1")
-        # the camera is above the ground at the upper border of the image
-        steepest = math.degrees(math.atan(self.sensor_size / 2 / self.f_range[0]))
-        lies = self.upright or self.resting
-        if self.ground and not (lies and self.views == 1 and self.pitch_range[0] > steepest):
-            raise ValueError(
-                f"ground: got upright={self.upright}, resting={self.resting}, views={self.views}, "
-                f"pitch_range={list(self.pitch_range)}; expected upright or resting, views=1, and pitch_range above "
-                f"{steepest:.3g} degrees, so that no horizon is in view"
-            )
+    def _is_a_scene(self) -> "DatasetSpec":
+        """Refuse the first combination of values that no kind of scene has."""
+        for is_wrong, complaint in _combinations(self, set(self.model_dump())):
+            if is_wrong:
+                raise ValueError(complaint)
         return self
 
     @property
@@ -260,6 +217,52 @@ class DatasetSpec(Record):
         """Sixteen hexadecimal digits that identify the values, the same on every machine."""
         canonical = json.dumps(self.model_dump(mode="json"), sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(canonical.encode()).hexdigest()[:16]
+
+
+def _combinations(spec: DatasetSpec, given: set[str]) -> list[tuple[object, str]]:
+    """Whether a specification, with these keys beyond their defaults, combines what does not fit; and what.
+
+    A scene shows a cylinder, in single images or sequences, or a mesh, in the field or in a box. Each kind has keys
+    that have their defaults in all others.
+    """
+    keys, is_mesh = list(DatasetSpec.model_fields), spec.mesh is not None
+    of_meshes, of_boxes = given & set(keys[keys.index("unit") :]), given & {"box_size", "box_shift", "edge_distance"}
+    moving = given & {"frame_rate", "speed", "spin_range", "camera_speed", "camera_turn"}
+    laws = [key for key in ("upright", "resting", "front") if getattr(spec, key)]
+    near, others = NEAREST * SOLID * spec.scale_range[1], 3 + len(spec.distractor_meshes)
+    alone = "view=box" * spec.is_box or "distractors or copies" * bool(spec.distractors or spec.copies)
+    # the camera is above the ground at the upper border of the image
+    steepest = math.degrees(math.atan(spec.sensor_size / 2 / spec.f_range[0]))
+    is_floor = (spec.upright or spec.resting) and spec.views == 1 and spec.pitch_range[0] > steepest
+    return [
+        (of_meshes and not is_mesh, f"{_names(of_meshes)}: for meshes alone; expected data=object data.mesh=FILE"),
+        (
+            not is_mesh and near > spec.z_range[0],
+            f"z_range: got {list(spec.z_range)}; expected at least {near:.3g} m, outside the objects",
+        ),
+        (is_mesh and spec.occluders, "occluders: for the cylinder alone; expected data.distractors=2"),
+        (is_mesh and spec.frames > 1, f"frames: got {spec.frames}; sequences are of the cylinder; expected 1"),
+        (moving and spec.frames == 1, f"{_names(moving)}: nothing moves in single images; expected data=sequence"),
+        (spec.view == "box", "view: got box; expected data.camera=FILE, or data.f, data.width and data.height"),
+        (of_boxes and not spec.is_box, f"{_names(of_boxes)}: got view=field; expected view=box"),
+        (alone and spec.views > 1, f"views: got {spec.views} with {alone}; expected 1"),
+        (
+            "front_range" in given and not any(spec.front or ()),
+            "front: expected a direction [x, y, z] with front_range",
+        ),
+        (laws[1:], f"{' and '.join(laws)}: different laws of rotations; expected one of them"),
+        (spec.distractors > others, f"distractors: got {spec.distractors}; expected at most {others}"),
+        (
+            spec.ground and not is_floor,
+            f"ground: got upright={spec.upright}, resting={spec.resting}, views={spec.views}, pitch_range="
+            f"{list(spec.pitch_range)}; expected upright or resting, views=1, and pitch_range above {steepest:.3g} "
+            "degrees, so that no horizon is in view",
+        ),
+    ]
+
+
+def _names(keys: set[str]) -> str:
+    return ", ".join(sorted(keys))
 
 
 def _whole(camera: Calibration, view: str, S: int, given: Any) -> tuple[float, float]:

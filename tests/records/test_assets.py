@@ -50,7 +50,7 @@ def refused(composed: Callable[..., dict[str, Any]], tmp_path: Path, monkeypatch
         ((PART, "data.reference=middle"), "data.reference: got 'middle'; expected origin, centroid"),
         ((PART, "data.unit=0"), "data.unit: got 0; expected to be greater than 0"),
         ((PART, "data.distractors=4"), "distractors: got 4; expected at most 3"),
-        ((PART, "data.distractors=1", "data.views=2"), "and 0 if views > 1"),
+        ((PART, "data.distractors=1", "data.views=2"), "views: got 2 with distractors or copies"),
         ((PART, "data.occluders=true"), "occluders: for the cylinder alone; expected data.distractors=2"),
         ((PART, "data.pitch_range=[-91,0]"), "data.pitch_range.0: got -91; expected to be greater than or equal"),
         (
@@ -59,7 +59,7 @@ def refused(composed: Callable[..., dict[str, Any]], tmp_path: Path, monkeypatch
             "expected upright or resting, views=1, and pitch_range above 5.33 degrees",
         ),
         ((PART, "data.ground=true"), "got upright=False, resting=False, views=1"),
-        ((PART, "data.upright=true", "data.resting=true"), "resting: got also upright, another law of rotations"),
+        ((PART, "data.upright=true", "data.resting=true"), "upright and resting: different laws of rotations"),
         (("data=default", "+data.unit=2.0"), "unit: for meshes alone; expected data=object data.mesh=FILE"),
     ],
 )

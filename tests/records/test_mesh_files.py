@@ -3,7 +3,6 @@
 import json
 import os
 import struct
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ from phd_exp.records.assets import mesh_asset
 from phd_exp.records.gltf import joined_gltf, split_gltf
 from phd_exp.records.mesh_files import read_mesh
 from phd_exp.rendering.triangles import Triangles
-from tests.support.meshes import named, ply_text, solid, write_mesh
+from tests.support.meshes import ply_text, solid, write_mesh
 
 CUBE = solid("cube")
 GLTF = {"asset": {"version": "2.0"}}
@@ -110,7 +109,7 @@ def test_what_cannot_be_drawn_is_named(tmp_path: Path, case: tuple[str, str, dic
     assert word in lost
 
 
-@pytest.mark.parametrize("suffix", [".glb", ".gltf", ".obj", ".ply", ".stl"])
+@pytest.mark.parametrize("suffix", [".obj", ".ply", ".stl"])
 @pytest.mark.parametrize("number", [np.nan, np.inf, -np.inf])
 def test_coordinates_are_finite(tmp_path: Path, suffix: str, number: float) -> None:
     vertices = CUBE.vertices.copy()
@@ -137,43 +136,6 @@ def test_coordinates_of_text_are_numbers(tmp_path: Path, name: str, text: str, n
     if (name, number) != ("a.ply", ""):  # a shorter row has still three columns
         with pytest.raises(ValueError, match=r"expected finite|cannot be read"):
             mesh.require_finite()
-
-
-def moving(document: dict[str, Any]) -> None:
-    document["animations"] = [{"channels": [], "samplers": []}]
-    document["meshes"][0] |= {"weights": [1.0]}
-    document["meshes"][0]["primitives"][0]["targets"] = [{"POSITION": 0}]
-    document["nodes"][0]["weights"] = [0.5]
-
-
-def other_scene(document: dict[str, Any]) -> None:
-    document |= {"nodes": [{"mesh": 0}, {"mesh": 0}], "scenes": [{"nodes": [1]}, {"nodes": [0]}], "scene": 1}
-
-
-def invisible(document: dict[str, Any]) -> None:
-    hidden = {"children": [2], "extensions": {"KHR_node_visibility": {"visible": False}}}
-    document |= {"nodes": [{"mesh": 0}, hidden, {"mesh": 0}], "scenes": [{"nodes": [0, 1]}]}
-    document |= {"extensionsRequired": ["KHR_node_visibility", "KHR_mesh_quantization"]}
-
-
-def invisible_without_scenes(document: dict[str, Any]) -> None:
-    invisible(document)
-    del document["scenes"]
-
-
-@pytest.mark.parametrize("change", [moving, other_scene, invisible, invisible_without_scenes])
-@pytest.mark.parametrize("suffix", [".glb", ".gltf"])
-def test_the_copy_is_the_default_scene_at_rest(
-    tmp_path: Path, suffix: str, change: Callable[[dict[str, Any]], None]
-) -> None:
-    file = write_mesh(tmp_path / f"part{suffix}", CUBE)
-    document, rest = split_gltf(file.read_bytes())
-    change(document)
-    file.write_bytes(joined_gltf(document, rest, is_binary=suffix == ".glb"))
-    copy, _ = split_gltf(read_mesh(file).copy)
-    assert [number for number, node in enumerate(copy["nodes"]) if "mesh" in node] == [0]
-    assert not {"animations", "weights", "targets"} & named(copy)
-    assert set(copy["extensionsRequired"]) <= {"KHR_mesh_quantization"}
 
 
 @pytest.mark.parametrize("suffix", [".glb", ".gltf"])

@@ -188,10 +188,11 @@ def test_grey_images_are_grey(of_box: MakeSpec) -> None:
         ({"camera": CAMERA | {"width": None}}, "camera: .* does not say the size"),
         ({"camera": {"f": 18.0, "width": 4000, "height": 3000}}, "shows 179 degrees; .* f in millimetres"),
         ({"camera": "nowhere.yaml"}, "camera: nowhere.yaml: No such file"),
-        ({"view": "field", "box_shift": 0.1}, "box_shift, edge_distance: got view=field; expected view=box"),
-        ({"view": "field", "edge_distance": 0.0}, "box_shift, edge_distance: got view=field; expected view=box"),
+        ({"view": "field", "box_shift": 0.1}, "box_shift: got view=field; expected view=box"),
+        ({"view": "field", "edge_distance": 0.0}, "edge_distance: got view=field; expected view=box"),
         ({"front_range": (0.0, 60.0)}, "front: expected a direction"),
         ({"views": 2}, "views: got 2 with view=box; expected 1"),
+        ({"camera": None, "views": 2, "copies": 1}, "views: got 2 with distractors or copies; expected 1"),
     ],
     ids=str,
 )

@@ -66,8 +66,3 @@ def test_blender_shows_each_copy_where_its_rays_are_and_none_in_a_scene_without(
             assert ((renderer.render(scene)[..., 3] > 0.5) != hit).sum() <= 6
             shown += int(hit.sum()) * (1 if scene is whole else -1)
     assert shown > 200, "pixels that only copies cover"
-
-
-def test_copies_are_not_for_several_views(of_mesh: MakeSpec) -> None:
-    with pytest.raises(ValueError, match="copies: got 1; expected 0 if views > 1"):
-        of_mesh(copies=1, views=2)

@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from phd_exp.records.errors import RenderError
-from phd_exp.records.gltf import split_gltf
+from phd_exp.records.gltf import joined_gltf, split_gltf
 from phd_exp.records.mesh_files import read_mesh
 from phd_exp.rendering import importing
 from phd_exp.rendering.blender import Renderer, Settings
@@ -64,23 +64,6 @@ def bounds(renderer: Renderer) -> list[float]:
     return [*vertices.min(axis=0), *vertices.max(axis=0)]
 
 
-TURNED_PARENT = [{"children": [1], "rotation": [0, 0, 0.5**0.5, 0.5**0.5]}, {"mesh": 0, "translation": [0.1, 0, 0]}]
-ONE_MIRRORED = [{"mesh": 0, "translation": [0, 0, 1]}, {"mesh": 0, "scale": [-1, 2, 1]}, {"children": [0, 1]}]
-
-
-@pytest.mark.parametrize(
-    ("nodes", "expected"),
-    [(TURNED_PARENT, [-0.1, -0.1, 0.0, 0.1, 0.1, 0.2]), (ONE_MIRRORED, [-0.1, -1.1, -0.2, 0.1, 0.1, 0.2])],
-    ids=["a turned parent", "two instances, one mirrored"],
-)
-def test_the_parts_of_a_file_are_one_object(tmp_path: Path, drawn: Callable, nodes: Any, expected: Any) -> None:
-    """The axes of glTF are (x, y, z) = (x, z, -y) of the local frame."""
-    file = write_mesh(tmp_path / "part.gltf", CUBE)
-    roots = [number for number in range(len(nodes)) if not any(number in node.get("children", ()) for node in nodes)]
-    file.write_text(json.dumps(json.loads(file.read_text()) | {"nodes": nodes, "scenes": [{"nodes": roots}]}))
-    assert bounds(drawn(file)[0]) == pytest.approx(expected, abs=1e-6)
-
-
 def scaled_with_targets(document: dict[str, Any]) -> None:
     document["nodes"] = [{"mesh": 0, "scale": [0.1, 0.1, 0.1]}]
     document["meshes"][0]["primitives"][0]["targets"] = [{"POSITION": 0}]
@@ -105,8 +88,10 @@ def two_scenes(document: dict[str, Any]) -> None:
 
 
 def partly_invisible(document: dict[str, Any]) -> None:
+    """Also without scenes, where every node without a parent is shown."""
     two_scenes(document)
-    document |= {"scenes": [{"nodes": [0, 1]}], "scene": 0, "extensionsRequired": ["KHR_node_visibility"]}
+    del document["scenes"], document["scene"]
+    document["extensionsRequired"] = ["KHR_node_visibility"]
     document["nodes"][0]["extensions"] = {"KHR_node_visibility": {"visible": False}}
 
 
@@ -121,16 +106,39 @@ def partly_transparent(document: dict[str, Any]) -> None:
     document["nodes"][1]["mesh"] = 1
 
 
-@pytest.mark.parametrize("change", [scaled_with_targets, animated, two_scenes, partly_invisible, partly_transparent])
-def test_what_is_drawn_is_what_is_labelled(tmp_path: Path, drawn: Callable, change: Change) -> None:
-    """Each has one visible cube, of 2 units scaled by 0.1, at the origin."""
-    file = write_mesh(tmp_path / "part.gltf", CUBE, per_metre=10)
-    document, _ = split_gltf(file.read_bytes())
+def turned_parent(document: dict[str, Any]) -> None:
+    turn = {"children": [1], "rotation": [0, 0, 0.5**0.5, 0.5**0.5], "scale": [0.1, 0.1, 0.1]}
+    document["nodes"] = [turn, {"mesh": 0, "translation": [1, 0, 0]}]
+
+
+def one_mirrored(document: dict[str, Any]) -> None:
+    """Two instances; the axes of glTF are (x, y, z) = (x, z, -y) of the local frame."""
+    nodes = [{"mesh": 0, "translation": [0, 0, 10]}, {"mesh": 0, "scale": [-1, 2, 1]}]
+    document["nodes"] = [{"children": [1, 2], "scale": [0.1, 0.1, 0.1]}, *nodes]
+
+
+PLAIN = [-0.1, -0.1, -0.1, 0.1, 0.1, 0.1]
+CHANGES: list[tuple[Change, list[float]]] = [
+    *(
+        (change, PLAIN)
+        for change in (scaled_with_targets, animated, two_scenes, partly_invisible, partly_transparent)
+    ),
+    (turned_parent, [-0.1, -0.1, 0.0, 0.1, 0.1, 0.2]),
+    (one_mirrored, [-0.1, -1.1, -0.2, 0.1, 0.1, 0.2]),
+]
+
+
+@pytest.mark.parametrize(("change", "expected"), CHANGES)
+@pytest.mark.parametrize("suffix", [".gltf", ".glb"])
+def test_what_is_drawn_is_what_is_labelled(
+    tmp_path: Path, drawn: Callable, suffix: str, change: Change, expected: list[float]
+) -> None:
+    """The visible parts of the default scene at rest, as one object."""
+    file = write_mesh(tmp_path / f"part{suffix}", CUBE, per_metre=10)
+    document, rest = split_gltf(file.read_bytes())
     change(document)
-    file.write_text(json.dumps(document))
-    renderer, _ = drawn(file)
-    assert renderer.meshes["mesh"].dimensions == SIZE
-    assert renderer.meshes["mesh"].radius == pytest.approx(0.1 * 3**0.5)
+    file.write_bytes(joined_gltf(document, rest, is_binary=suffix == ".glb"))
+    assert bounds(drawn(file)[0]) == pytest.approx(expected, abs=1e-6)
 
 
 def test_points_outside_all_faces_do_not_count(tmp_path: Path, drawn: Callable) -> None:
@@ -214,53 +222,31 @@ def test_a_texture_much_finer_than_the_image_is_no_noise(tmp_path: Path, of_mesh
     assert shown.std() < 0.25 * shown.mean()
 
 
-def test_a_texture_is_part_of_the_mesh_and_must_be_there(tmp_path: Path, of_mesh: MakeSpec, drawn: Callable) -> None:
-    file = obj(tmp_path / "part.obj", "mtllib part.mtl\nusemtl wood\n", "newmtl wood\nmap_Kd wood.png\n")
-    with pytest.raises(RenderError, match=r"part\.obj: wood\.png is missing; .*data\.ignore=\[materials\]"):
-        drawn(file)
-    Image.new("RGB", (8, 8), (200, 0, 0)).save(tmp_path / "wood.png")
-    before = of_mesh(mesh=str(file)).mesh
-    assert list(before.files) == ["part.obj", "part.mtl", "wood.png"]
-    Image.new("RGB", (8, 8), (0, 200, 0)).save(tmp_path / "wood.png")
-    assert of_mesh(mesh=str(file)).mesh != before
+def coloured(path: Path, colours: list[str]) -> Path:
+    """An OBJ whose vertices have colours."""
+    lines = write_mesh(path, CUBE).read_text().splitlines()
+    path.write_text("\n".join([*map("".join, zip(lines, colours, strict=False)), *lines[8:], ""]))
+    return path
 
 
-REFUSED = [
-    ("lost.obj", "mtllib lost.mtl\nusemtl red\n", "newmtl blue\n", "no material is named 'red'"),
-    ("clear.obj", "mtllib clear.mtl\nusemtl glass\n", "newmtl glass\nd 0\n", "transparent everywhere"),
-    (
-        "broken.obj",
-        "mtllib broken.mtl\nusemtl red\n",
-        "newmtl red\nmap_Kd broken.mtl\n",
-        r"broken\.mtl cannot be read",
-    ),
-]
+USED = "mtllib a.mtl\nusemtl red\n"
+REFUSED: dict[str, tuple[Callable[[Path], Path], str]] = {
+    "lost": (lambda path: obj(path, USED, "newmtl blue\n"), "no material is named 'red'"),
+    "clear": (lambda path: obj(path, USED, "newmtl red\nd 0\n"), "transparent everywhere"),
+    "broken": (lambda path: obj(path, USED, "newmtl red\nmap_Kd a.mtl\n"), r"a\.mtl cannot be read"),
+    "missing": (lambda path: obj(path, USED, "newmtl red\nmap_Kd wood.png\n"), r"wood\.png is missing"),
+    "large": (lambda path: coloured(path, [" 255 128 0"] * 8), "its colours reach"),
+    "few": (lambda path: coloured(path, [" 1 0 0", *[""] * 7]), "colours of its vertices cannot be read"),
+    "nan": (lambda path: coloured(path, [*[" 1 0 0"] * 7, " nan nan nan"]), "colours of its vertices cannot be read"),
+}
 
 
-@pytest.mark.parametrize(("name", "head", "mtl", "message"), REFUSED)
-def test_materials_are_refused_or_ignored(
-    tmp_path: Path, make_spec: MakeSpec, drawn: Callable, name: str, head: str, mtl: str, message: str
+@pytest.mark.parametrize(("write", "message"), REFUSED.values(), ids=REFUSED)
+def test_colours_that_cannot_be_drawn_are_refused_or_ignored(
+    tmp_path: Path, drawn: Callable, write: Callable[[Path], Path], message: str
 ) -> None:
-    file = obj(tmp_path / name, head, mtl)
-    with pytest.raises(RenderError, match=rf"^data\.mesh: {name}: .*{message}.*data\.ignore=\[materials\]") as error:
-        drawn(file)
-    assert "\n" not in str(error.value)
-    drawn(file, ignore=["materials"])
-
-
-@pytest.mark.parametrize(
-    ("colours", "message"),
-    [
-        ([" 255 128 0"] * 8, "its colours reach"),
-        ([" 1 0 0", *[""] * 7], "colours of its vertices cannot be read"),
-        ([*[" 1 0 0"] * 7, " nan nan nan"], "colours of its vertices cannot be read"),
-    ],
-)
-def test_strange_colours_are_refused(tmp_path: Path, drawn: Callable, colours: list[str], message: str) -> None:
-    file = write_mesh(tmp_path / "a.obj", CUBE)
-    lines = file.read_text().splitlines()
-    file.write_text("\n".join([*map("".join, zip(lines, colours, strict=False)), *lines[8:], ""]))
-    with pytest.raises(RenderError, match=message):
+    file = write(tmp_path / "a.obj")
+    with pytest.raises(RenderError, match=rf"^data\.mesh: a\.obj: .*{message}.*data\.ignore=\[materials\]"):
         drawn(file)
     drawn(file, ignore=["materials"])
 
@@ -322,7 +308,6 @@ def test_the_unit_that_an_obj_states(tmp_path: Path, text: str, unit: float | No
     [
         ("none.obj", b"v 0 0 0\n", {}, "has no faces; expected a surface"),
         ("line.obj", b"v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", {}, "its faces have no area"),
-        ("text.stl", b"not a mesh", {}, "text.stl: .*Failed to read"),
         ("short.ply", b"ply\nformat ascii 1.0\nelement face 10000000\nend_header\n", {}, "short.ply: "),
         (
             "cup.stl",
@@ -331,7 +316,6 @@ def test_the_unit_that_an_obj_states(tmp_path: Path, text: str, unit: float | No
             r"longest side is 200 m, .* set data\.unit=0\.001 \(0\.2 m\) or 0\.01 \(2 m\)$",
         ),
         ("cup.stl", solid("cylinder", 1e-4), {}, r"longest side is 0\.0001 m, .*; no usual unit leads there$"),
-        ("cup.stl", solid("cylinder", 0.06), {"unit": 0.01}, r"side is 0\.0006 m, .* or 1 \(0\.06 m\)$"),
         (
             "cup.stl",
             solid("cylinder", 4.3),
@@ -351,7 +335,6 @@ def test_the_unit_that_an_obj_states(tmp_path: Path, text: str, unit: float | No
             r"farthest point 3\.39 m.* or data\.z_range above 3\.56 m",
         ),
         ("cup.stl", solid("cylinder", 0.2, (50, 0, 0)), {}, r"side is 0\.2 m, .* set data\.reference=centroid$"),
-        ("cup.stl", solid("cylinder", 200, (5e4, 0, 0)), {}, r"0\.001 .*2 m\) and data\.reference=centroid$"),
         (
             "cup.stl",
             solid("cylinder", 0.2, (5e4, 0, 0)),

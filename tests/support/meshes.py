@@ -4,7 +4,6 @@ import json
 import struct
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -106,9 +105,3 @@ def ply_text(
     rows = [f"{x!r} {y!r} {z!r} {vertex}".rstrip() for x, y, z in mesh.vertices.tolist()]
     rows += [f"3 {a} {b} {c} {face}".rstrip() for a, b, c in mesh.corners.tolist()]
     return "\n".join([*head, "end_header", *rows, ""])
-
-
-def named(document: Any) -> set[str]:
-    """All keys of a document, at any depth."""
-    items = document.values() if isinstance(document, dict) else document if isinstance(document, list) else []
-    return {*(document if isinstance(document, dict) else ()), *(key for item in items for key in named(item))}
