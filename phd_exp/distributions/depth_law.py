@@ -1,16 +1,9 @@
-"""The law of t = z / mu_z: that of the paper, whose density has a kink at its mode, or one with a rounded mode."""
+"""The interface of laws of t = z / mu_z: `Kinked` is the paper's, `Rounded` has a rounded mode."""
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
-from typing import final
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
-
-from phd_exp.distributions import depth
-from phd_exp.distributions.level import credible_level
-from phd_exp.distributions.special import log_scaled_normaliser
 
 Numbers = Float[Tensor, "*#batch"]
 
@@ -51,7 +44,7 @@ class DepthLaw(ABC):
     @property
     @abstractmethod
     def excess_moments(self) -> tuple[Numbers, Numbers]:
-        """Mean and variance of a (t - 1)."""
+        """Mean and variance of a (t - 1), the depth beyond the mode in units of the law's width."""
 
     @property
     def moments(self) -> tuple[Numbers, Numbers]:
@@ -71,64 +64,8 @@ class DepthLaw(ABC):
         """The mean excess energy."""
 
     @abstractmethod
-    def slope(self, log_t: Numbers) -> Numbers:
-        """The derivative of the energy with respect to log a; that of `log_normaliser` is -`mean_slope`."""
-
-    @property
-    @abstractmethod
-    def mean_slope(self) -> Numbers:
-        """The mean of `slope` over the law."""
-
-    @abstractmethod
     def crps_beyond_distance(self, log_t: Numbers) -> Numbers:
-        """a (CRPS(t) - |t - 1|): the score minus the distance from the mode, in units of 1/a."""
+        """a (CRPS(t) - |t - 1|): the score minus the distance from the mode, in units of 1/a.
 
-
-@final
-@dataclass(frozen=True)
-class Kinked(DepthLaw):
-    """The law of the paper, with the energy a max(t, 1/t); closed forms of `phd_exp.distributions.depth`."""
-
-    log_a: Numbers
-
-    def energy(self, log_t: Numbers) -> Numbers:
-        return depth.depth_energy(log_t, self.log_a)
-
-    def farthest_log_t(self, energy: Numbers) -> Numbers:
-        return torch.log1p(energy / self.log_a.exp())
-
-    @property
-    def log_normaliser(self) -> Numbers:
-        return log_scaled_normaliser(self.log_a)
-
-    def level(self, energy: Numbers) -> Numbers:
-        return credible_level(energy, self.log_a.exp())
-
-    def cdf(self, log_t: Numbers) -> Numbers:
-        return depth.depth_cdf(log_t, self.log_a)
-
-    def icdf(self, p: Numbers) -> Numbers:
-        return depth.depth_icdf(p, self.log_a)
-
-    @property
-    def excess_moments(self) -> tuple[Numbers, Numbers]:
-        return depth.depth_excess_moments(self.log_a)
-
-    @property
-    def inverse_moments(self) -> tuple[Numbers, Numbers]:
-        shortfall = depth.inverse_depth_shortfall(self.log_a.exp())
-        return shortfall, shortfall * (2 - shortfall)  # E[1/t^2] = 1
-
-    @property
-    def mean_energy(self) -> Numbers:
-        return depth.depth_mean_energy(self.log_a)
-
-    def slope(self, log_t: Numbers) -> Numbers:
-        return self.energy(log_t)
-
-    @property
-    def mean_slope(self) -> Numbers:
-        return self.mean_energy
-
-    def crps_beyond_distance(self, log_t: Numbers) -> Numbers:
-        return depth.crps_beyond_distance(log_t, self.log_a)
+        The continuous ranked probability score is int (F(u) - 1[u >= t])^2 du = E|T - t| - E|T - T'|/2.
+        """

@@ -57,7 +57,7 @@ class GaussianMixture(Density):
     def level(self, xyz: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*#batch"]:
         """The share of the density that is higher than here, by 512 quasi-random draws of each Gaussian.
 
-        It errs by less than 0.01. Source: own derivation; checked in tests/distributions/test_heads.py.
+        It errs by less than 0.01. Source: own derivation; checked in tests/distributions/test_laws.py.
         """
         log_p, batch = self.log_prob(xyz), self.log_weight.ndim - 1
         normal = _normal_draws().to(log_p).reshape(-1, *[1] * (batch + 1), 3)
@@ -65,7 +65,8 @@ class GaussianMixture(Density):
         drawn, order = drawn.flatten(0, 1).movedim(0, -1).sort(dim=-1)
         weight = self._weight.repeat(*[1] * batch, _DRAWS).gather(-1, order) / _DRAWS
         above = pad(weight.flip(-1).cumsum(-1).flip(-1), (0, 1))
-        at = log_p.reshape(-1, *log_p.shape[log_p.ndim - batch :]).movedim(0, -1)
+        lead = log_p.shape[: log_p.ndim - batch]
+        at = log_p.reshape(lead.numel(), *log_p.shape[len(lead) :]).movedim(0, -1)
         place = torch.searchsorted(drawn.contiguous(), at.contiguous(), right=True)
         return above.gather(-1, place).movedim(-1, 0).reshape(log_p.shape)
 

@@ -1,6 +1,6 @@
 """Laws of the variables of a `Whitening`: q, two numbers with an isotropic law, and s, one number for depth.
 
-tests/distributions/test_heads.py checks every law.
+tests/distributions/test_laws.py checks every law.
 """
 
 import math
@@ -15,10 +15,8 @@ from scipy import special
 from torch import Tensor
 from torch.distributions import Normal
 
-from phd_exp.distributions import depth, huber
-from phd_exp.distributions.level import credible_level
-from phd_exp.distributions.projected_huber import ProjectedHuber
-from phd_exp.distributions.special import log_scaled_normaliser
+from phd_exp.distributions import huber
+from phd_exp.distributions.kinked import Kinked
 
 Pair = Float[Tensor, "*#batch 2"]
 Number = Float[Tensor, "*#batch"]
@@ -125,25 +123,26 @@ class StudentLaw(Law):
 class HuberLaw(Law):
     """q and s = a log t of the Projected Huber density, independent of each other."""
 
-    around: ProjectedHuber
+    a: Float[Tensor, "*batch"]
     variance = huber.HUBER_COVARIANCE
 
-    def _energy(self, q: Pair, s: Number) -> Number:
-        return huber.huber_energy(q) + depth.depth_energy(s / self.around.a, self.around.a.log())
+    @property
+    def _depth(self) -> Kinked:
+        return Kinked(self.a.log())
 
     def log_prob(self, q: Pair, s: Number) -> Number:
-        log_a = self.around.a.log()  # dt = t ds / a
-        normaliser = huber.HUBER_LOG_NORMALISER + log_scaled_normaliser(log_a) + log_a
-        return s / self.around.a - self._energy(q, s) - normaliser
+        log_t = s / self.a  # dt = t ds / a
+        normaliser = huber.HUBER_LOG_NORMALISER + self._depth.log_normaliser + self.a.log()
+        return log_t - huber.huber_energy(q) - self._depth.energy(log_t) - normaliser
 
     def level(self, q: Pair, s: Number) -> Number:
-        return credible_level(self._energy(q, s), self.around.a)
+        return self._depth.level(huber.huber_energy(q) + self._depth.energy(s / self.a))
 
     def cdf(self, s: Number) -> Number:
-        return depth.depth_cdf(s / self.around.a, self.around.a.log())
+        return self._depth.cdf(s / self.a)
 
     def icdf(self, p: Number) -> Number:
-        return self.around.a * depth.depth_icdf(p, self.around.a.log())
+        return self.a * self._depth.icdf(p)
 
     def draw(self, shape: Sequence[int], like: Tensor, generator: torch.Generator | None) -> tuple[Pair, Number]:
         _, s = super().draw(shape, like, generator)

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from phd_exp.distributions import spd
 from phd_exp.distributions.density import quantile_between
-from phd_exp.distributions.depth import depth_mean_energy
 from phd_exp.distributions.huber import RADIAL_NORMALISER
+from phd_exp.distributions.kinked import Kinked
 from phd_exp.distributions.projected_huber import ProjectedHuber
 from phd_exp.distributions.rounded import Rounded, depth_law
 from phd_exp.distributions.special import expint_differences
@@ -140,7 +140,7 @@ def _closest_depth(members: ProjectedHuber) -> tuple[Float[Tensor, "*batch"], Fl
         """Whether log mu_z is larger than `place`, and the best a there."""
         far, near, ahead, before = _partial_moments(a, of_a, place[..., None] - log_mu)
         best = 1 / (far - near + ahead).clamp_min(torch.finfo(a.dtype).tiny)
-        energy = depth_mean_energy(best.log())
+        energy = Kinked(best.log()).mean_energy
         two, one_two, _ = expint_differences(best)
         is_flat = best < 1  # the same is then compared without a difference of large numbers
         value = torch.where(is_flat, before, (far + near) * best)

@@ -6,11 +6,12 @@ The density needs no inverse of a matrix.
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.distributions import constraints
 from torch.distributions.constraints import Constraint
 
 from phd_exp.distributions import spd
@@ -19,6 +20,18 @@ from phd_exp.distributions.special import signed_log1p
 LARGEST_RATIO = 100.0
 """Of the eigenvalues of B, and so of A. Larger ones, on unusual images, were useless."""
 _EVENT_DIMS = {"A_xy": 2, "nu_xy": 1, "k": 1}
+LARGEST_RAW = 1e9  # squares of larger raw numbers, and their products, would overflow in float32
+CONSTRAINTS: dict[str, Constraint] = {
+    "mu_xy": constraints.real_vector,
+    "mu_z": constraints.positive,
+    "A": constraints.positive_definite,
+    "a": constraints.positive,
+    "k": constraints.real_vector,
+    "raw": constraints.independent(constraints.interval(-LARGEST_RAW, LARGEST_RAW), 1),
+    "f": constraints.positive,
+    "S": constraints.positive,
+    "mu_z0": constraints.positive,
+}
 
 
 @dataclass(frozen=True)
@@ -91,6 +104,34 @@ class Natural:
         )
 
     @property
+    def slope(self) -> Float[Tensor, "*batch 2"]:
+        """A_xy m_xy with the slope m_xy of the axis, 1/metres."""
+        return (
+            self.nu_xy if self.k is None else self.nu_xy - self.k * torch.exp(self.log_a - self.log_mu_z)[..., None]
+        )
+
+    def turn(self, z: Float[Tensor, "*#batch"]) -> Float[Tensor, "*#batch 2"]:
+        """k a (t - 1), the further term of q with a free axis, at depths z (metres)."""
+        assert self.k is not None
+        # a t, because t itself may overflow where a underflows
+        return self.k * (torch.exp(self.log_a - self.log_mu_z) * z - self.log_a.exp())[..., None]
+
+    def tempered(
+        self, projected: Float[Tensor, "*#batch"] | float, depth: Float[Tensor, "*#batch"] | float
+    ) -> "Natural":
+        """The parameters with A / projected and a / depth in place of A and a, around the same mode and axis."""
+        projected, depth = (torch.as_tensor(one).to(self.log_a) for one in (projected, depth))
+        across = projected[..., None]
+        return replace(
+            self,
+            A_xy=self.A_xy / across[..., None],
+            nu_xy=self.nu_xy / across,
+            log_det_A_xy=self.log_det_A_xy - 2 * projected.log(),
+            log_a=self.log_a - depth.log(),
+            k=None if self.k is None else self.k * (depth[..., None] / across),
+        )
+
+    @property
     def batch_shape(self) -> torch.Size:
         """The common batch shape of the parameters."""
         first, *others = (_batch_shape(name, value) for name, value in self._tensors.items())
@@ -121,18 +162,20 @@ def _batch_shape(name: str, value: Tensor) -> torch.Size:
     return torch.Size(value.shape[: value.ndim - _EVENT_DIMS.get(name, 0)])
 
 
-def require(name: str, value: Tensor, constraint: Constraint) -> None:
+def require(**values: Tensor | float | None) -> None:
     """Raise a ValueError that names the parameter, its shape, its constraint and an invalid value."""
-    if value.numel() == 0:  # which torch's constraints cannot check
-        return
-    # a constraint on vectors or matrices gives one result for each of them
-    batch = value.shape[: value.ndim - constraint.event_dim]
-    invalid = ~(constraint.check(value) & value.isfinite().reshape((*batch, -1)).all(-1))
-    if bool(invalid.any()):
-        raise ValueError(
-            f"{name} of shape {tuple(value.shape)} must be finite and satisfy {constraint}, "
-            f"but {int(invalid.sum())} of {invalid.numel()} do not, the first of them {value[invalid][0].tolist()}"
-        )
+    for name, value in ((name, torch.as_tensor(value)) for name, value in values.items() if value is not None):
+        constraint = CONSTRAINTS[name]
+        if value.numel() == 0:  # which torch's constraints cannot check
+            continue
+        # a constraint on vectors or matrices gives one result for each of them
+        batch = value.shape[: value.ndim - constraint.event_dim]
+        invalid = ~(constraint.check(value) & value.isfinite().reshape((*batch, -1)).all(-1))
+        if bool(invalid.any()):
+            raise ValueError(
+                f"{name} of shape {tuple(value.shape)} must be finite and satisfy {constraint}, "
+                f"but {int(invalid.sum())} of {invalid.numel()} do not, the first {value[invalid][0].tolist()}"
+            )
 
 
 def require_positions(xyz: Tensor, batch_shape: torch.Size) -> None:

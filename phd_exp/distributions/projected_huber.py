@@ -17,18 +17,15 @@ from typing import ClassVar, Literal, final
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.distributions import Distribution, constraints
-from torch.distributions.constraints import Constraint
+from torch.distributions import Distribution
 from torch.nn.functional import pad
 
 from phd_exp.distributions import huber, spd
 from phd_exp.distributions.density import Density
 from phd_exp.distributions.depth_law import DepthLaw
-from phd_exp.distributions.natural import Natural, require, require_positions
+from phd_exp.distributions.natural import CONSTRAINTS, Natural, require, require_positions
 from phd_exp.distributions.rounded import depth_law
 from phd_exp.geometry.camera import at_depth
-
-LARGEST_RAW = 1e9  # squares of larger raw numbers, and their products, would overflow in float32
 
 
 @final
@@ -62,16 +59,7 @@ class ProjectedHuber(Density, Distribution):
     """
 
     has_closed_forms: ClassVar[Literal[True]] = True
-    arg_constraints: ClassVar[dict[str, Constraint]] = {
-        "mu_xy": constraints.real_vector,
-        "mu_z": constraints.positive,
-        "A": constraints.positive_definite,
-        "a": constraints.positive,
-        "k": constraints.real_vector,
-    }
-    support = constraints.independent(
-        constraints.cat([constraints.real, constraints.positive], dim=-1, lengths=[2, 1]), 1
-    )
+    arg_constraints = CONSTRAINTS
     has_rsample = True
 
     def __init__(
@@ -85,13 +73,12 @@ class ProjectedHuber(Density, Distribution):
         rounding: float = 0.0,
     ) -> None:
         if _wants_validation(validate_args):
-            for name, value in (("mu_xy", mu_xy), ("mu_z", mu_z), ("A", A), ("a", a), ("k", k)):
-                if value is not None:
-                    require(name, value, self.arg_constraints[name])
+            require(mu_xy=mu_xy, mu_z=mu_z, A=A, a=a, k=k)
             if not 0 <= rounding < math.inf:
                 raise ValueError(f"rounding: got {rounding}; expected a finite number of at least 0")
         self._adopt(Natural.from_camera_frame(mu_xy, mu_z, A, a, k, rounding), validate_args)
-        self._require_representable()
+        if self._validate_args:
+            self._require_representable()
 
     @classmethod
     def about_axis(
@@ -124,10 +111,8 @@ class ProjectedHuber(Density, Distribution):
     ) -> "ProjectedHuber":
         """The distribution of the raw numbers (n_1, n_2, b_1, b_2, b_3, w_1, w_2) of a network, as `predict` uses it.
 
-        Nine numbers (..., w_1, w_2, k_1, k_2) give a free axis.
-
-        The lesser eigenvalue of A is raised to at least 1/100 of the greater, a constant for the gradient. The
-        constructor takes any A.
+        Nine numbers (..., w_1, w_2, k_1, k_2) give a free axis. The lesser eigenvalue of A is raised to at least
+        1/100 of the greater, a constant for the gradient; the constructor takes any A.
 
         Args:
             raw: the raw numbers.
@@ -147,11 +132,10 @@ class ProjectedHuber(Density, Distribution):
             raise ValueError(f"raw: got shape {tuple(raw.shape)}; expected 7 as the last dimension, or 9 with k")
         f = torch.as_tensor(f, dtype=raw.dtype, device=raw.device)
         if _wants_validation(validate_args):
-            require("raw", raw, constraints.independent(constraints.interval(-LARGEST_RAW, LARGEST_RAW), 1))
-            for name, value in (("f", f), ("S", S), ("mu_z0", mu_z0)):
-                require(name, torch.as_tensor(value), constraints.positive)
+            require(raw=raw, f=f, S=S, mu_z0=mu_z0)
         distribution = cls._of(Natural.from_raw(raw, f, S, mu_z0), validate_args)
-        distribution._require_representable()
+        if distribution._validate_args:
+            distribution._require_representable()
         return distribution
 
     @classmethod
@@ -168,12 +152,9 @@ class ProjectedHuber(Density, Distribution):
         self._validate_args = _wants_validation(validate_args)
 
     def _require_representable(self) -> None:
-        """Raise ValueError if mode or covariances overflow in the data type, unless validation is off."""
-        if not self._validate_args:
-            return
-        covariances = (self.covariance_matrix, self.projected_covariance)
-        parts = [self.mode, self.mean, *(covariance.flatten(-2) for covariance in covariances)]
-        overflow = ~torch.cat(parts, dim=-1).isfinite().all(-1)
+        """Raise ValueError if mode or covariances overflow in the data type."""
+        covariances = (self.covariance_matrix.flatten(-2), self.projected_covariance.flatten(-2))
+        overflow = ~torch.cat([self.mode, self.mean, *covariances], dim=-1).isfinite().all(-1)
         if bool(overflow.any()):
             raise ValueError(
                 f"parameters: mode or covariance of {int(overflow.sum())} of {overflow.numel()} distributions "
@@ -200,16 +181,7 @@ class ProjectedHuber(Density, Distribution):
         self, projected: Float[Tensor, "*#batch"] | float, depth: Float[Tensor, "*#batch"] | float
     ) -> "ProjectedHuber":
         """The distribution with A / projected and a / depth in place of A and a, around the same mode and axis."""
-        n = self._natural
-        projected, depth = (
-            torch.as_tensor(one, dtype=n.log_a.dtype, device=n.log_a.device) for one in (projected, depth)
-        )
-        log_det_A_xy, log_a = n.log_det_A_xy - 2 * projected.log(), n.log_a - depth.log()
-        across = projected[..., None]
-        k = None if n.k is None else n.k * (depth[..., None] / across)
-        A_xy, nu_xy = n.A_xy / across[..., None], n.nu_xy / across
-        tempered = replace(n, A_xy=A_xy, nu_xy=nu_xy, log_det_A_xy=log_det_A_xy, log_a=log_a, k=k)
-        return self._of(tempered, self._validate_args)
+        return self._of(self._natural.tempered(projected, depth), self._validate_args)
 
     def __repr__(self) -> str:
         return f"ProjectedHuber(batch_shape={tuple(self.batch_shape)})"
@@ -228,13 +200,7 @@ class ProjectedHuber(Density, Distribution):
     @property
     def m_xy(self) -> Float[Tensor, "*batch 2"]:
         """Slope of the axis, the change of the centre of (x, y) with z; mu_xy without a free axis."""
-        return spd.matvec(self._A_xy_inverse, self._slope)
-
-    @property
-    def _slope(self) -> Float[Tensor, "*batch 2"]:
-        """A_xy m_xy, 1/metres."""
-        n = self._natural
-        return n.nu_xy if n.k is None else n.nu_xy - n.k * torch.exp(n.log_a - n.log_mu_z)[..., None]
+        return spd.matvec(self._A_xy_inverse, self._natural.slope)
 
     @property
     def apex(self) -> Float[Tensor, "*batch 3"]:
@@ -289,25 +255,14 @@ class ProjectedHuber(Density, Distribution):
     def measure(self) -> Float[Tensor, "*batch 3 3"]:
         """The matrix from a position relative to the apex (metres) to (q, t), with t = z/mu_z."""
         n = self._natural
-        q = torch.cat([n.A_xy, -self._slope[..., None]], -1)
+        q = torch.cat([n.A_xy, -n.slope[..., None]], -1)
         return torch.cat([q, pad(torch.exp(-n.log_mu_z)[..., None, None], (2, 0))], -2)
 
     def whiten(self, xyz: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*#batch 2"]:
         """The projection in units of its precision, q = A ((x, y)/z - mu_xy) t, with a free axis plus k a (t - 1)."""
         n = self._natural
         q = spd.matvec(n.A_xy, xyz[..., :2]) - n.nu_xy * xyz[..., 2:]
-        return q if n.k is None else q + self._turn(xyz[..., 2])
-
-    def _turn(self, z: Tensor) -> Tensor:
-        """k a (t - 1), the further term of q with a free axis."""
-        n = self._natural
-        assert n.k is not None
-        # a t, because t itself may overflow where a underflows
-        return n.k * (torch.exp(n.log_a - n.log_mu_z) * z - n.log_a.exp())[..., None]
-
-    def depth_energy(self, z: Float[Tensor, "*#batch"]) -> Float[Tensor, "*#batch"]:
-        """The excess energy of a depth z > 0 (metres); a (max(t, 1/t) - 1) with t = z/mu_z if nothing is rounded."""
-        return self.depth_law.energy(z.log() - self._natural.log_mu_z)
+        return q if n.k is None else q + n.turn(xyz[..., 2])
 
     def log_prob(self, value: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*#batch"]:
         """Log density of a position (metres), nats per cubic metre; -inf, with zero gradient, for z <= 0.
@@ -332,7 +287,8 @@ class ProjectedHuber(Density, Distribution):
         visible = (xyz[..., 2] > 0) & (xyz.abs().amax(-1) != torch.inf)
         # other positions are replaced, so that no NaN is multiplied by a zero gradient
         xyz = xyz.masked_fill(~visible[..., None], 1)
-        return huber.huber_energy(self.whiten(xyz)) + self.depth_energy(xyz[..., 2]), visible
+        depth_energy = self.depth_law.energy(xyz[..., 2].log() - self._natural.log_mu_z)
+        return huber.huber_energy(self.whiten(xyz)) + depth_energy, visible
 
     def level(self, xyz: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*#batch"]:
         """Credible level of a position: the probability of the smallest region of highest density that contains it.
@@ -341,7 +297,7 @@ class ProjectedHuber(Density, Distribution):
         In float32, where positions and mu_z are rounded, it errs by about 1e-7 ((|k| + 1) a + |A|): use float64 where
         that is above 1e-3.
 
-        Source: own derivation, see `credible_level`.
+        Source: own derivation, see `Kinked.level` and `Rounded.level`.
         """
         energy, visible = self._excess_energy(xyz)
         return self.depth_law.level(energy).masked_fill(~visible, 1)
@@ -444,7 +400,7 @@ class ProjectedHuber(Density, Distribution):
         p = torch.rand(shape, dtype=dtype, device=device, generator=generator)
         z = self.depth_icdf(p.clamp_min(torch.finfo(dtype).eps / 2))  # rand may return 0, where z would be 0
         across = q + self._natural.nu_xy * z[..., None]
-        xy = spd.matvec(self._A_xy_inverse, across if self.k is None else across - self._turn(z))
+        xy = spd.matvec(self._A_xy_inverse, across if self.k is None else across - self._natural.turn(z))
         return torch.cat([xy, z[..., None]], dim=-1)
 
     def entropy(self) -> Float[Tensor, "*batch"]:

@@ -3,7 +3,7 @@
 A `Whitening` turns a position into two variables q and s, and a `Law` gives their density. The seven raw numbers are
 the same, so that only the law differs.
 
-Source: own derivation; tests/distributions/test_heads.py checks every density.
+Source: own derivation; tests/distributions/test_laws.py checks every density.
 """
 
 from collections.abc import Sequence
@@ -176,4 +176,4 @@ def Decomposed(around: ProjectedHuber, _: Tensor) -> Shaped:
 
     Source: paper, Proposition 1: no density that decomposes in this way satisfies all seven constraints.
     """
-    return Shaped(Whitening(around, 0), HuberLaw(around))
+    return Shaped(Whitening(around, 0), HuberLaw(around.a))

@@ -9,7 +9,6 @@ All use two schemes that meet at a = 1. Neither loses digits to cancellation, in
 Source: DLMF 6.6 and 8.19 for the series; the rule is an own derivation, see `GAUSS_RULE`.
 """
 
-import inspect
 import math
 import sys
 from collections.abc import Callable
@@ -88,19 +87,10 @@ def tail_moment(k: int, a: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     Source: own derivation (differentiate under the integral); checked against mpmath in
     tests/distributions/test_special.py.
     """
-    function = _TailMoment if torch.compiler.is_compiling() else _DualTailMoment
-    value: Tensor = function.apply(a, k)[0]
+    if torch.compiler.is_compiling():  # which takes no Function with forward mode, and fuses what autograd does
+        return _tail_moment_and_derivative(k, a)[0]
+    value: Tensor = _TailMoment.apply(a, k)[0]
     return value
-
-
-def log_scaled_normaliser(log_a: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-    """The log normaliser without its leading term, log(e^a N(a)) = log(1 + g(a)) - log a, as a function of log a.
-
-    Finite, with finite derivatives, also where a underflows.
-
-    Source: paper, section "Computing normalizing factor".
-    """
-    return torch.log1p(tail_moment(0, log_a.exp())) - log_a
 
 
 def log_normaliser(a: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
@@ -111,7 +101,7 @@ def log_normaliser(a: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
 
     Source: paper, section "Computing normalizing factor".
     """
-    return log_scaled_normaliser(a.log()) - a
+    return torch.log1p(tail_moment(0, a)) - a.log() - a
 
 
 def weighted_integral(F: Callable[[Tensor], Tensor], like: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
@@ -126,50 +116,17 @@ def weighted_integral(F: Callable[[Tensor], Tensor], like: Float[Tensor, "*batch
 def signed_log1p(x: Float[Tensor, "*#batch"], log_a: Float[Tensor, "*#batch"]) -> Float[Tensor, "*#batch"]:
     """sign(x) log(1 + |x|/a), smooth at x = 0 with the derivative 1 / (a + |x|); finite where a underflows.
 
-    The derivative in x is bounded by the inverse of the machine epsilon.
+    The derivative in x is bounded by the inverse of the machine epsilon, below which |x| and a count as small.
 
     Source: own derivation (log nu_z as a function of w_2, for both branches of the paper's activation); checked in
     tests/distributions/test_special.py.
     """
-    function = _SignedLog1p if torch.compiler.is_compiling() else _DualSignedLog1p
-    value: Tensor = function.apply(*torch.broadcast_tensors(x, log_a))
-    return value
-
-
-class _SignedLog1p(torch.autograd.Function):
-    """sign(x) log(1 + |x|/a): autograd would differentiate |x| and log|x| at 0, and get 0 or NaN instead of 1/a."""
-
-    generate_vmap_rule = True
-
-    @staticmethod
-    def forward(x: Tensor, log_a: Tensor) -> Tensor:
-        log_ratio = x.abs().log() - log_a
-        return x.sign() * torch.logaddexp(torch.zeros_like(log_ratio), log_ratio)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: Tensor) -> None:
-        ctx.save_for_backward(*inputs)
-        ctx.save_for_forward(*inputs)
-
-    @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor]:
-        x, log_a = ctx.saved_tensors
-        by_x = grad * _SignedLog1p.slope(x, log_a)
-        return by_x, -by_x * x
-
-    @staticmethod
-    def slope(x: Tensor, log_a: Tensor) -> Tensor:
-        return 1 / (log_a.exp() + x.abs()).clamp_min(torch.finfo(x.dtype).eps)
-
-
-class _DualSignedLog1p(_SignedLog1p):
-    """With forward mode, which torch.compile refuses."""
-
-    @staticmethod
-    def jvp(ctx: Any, x_dot: Tensor, log_a_dot: Tensor) -> Tensor:
-        _refuse_nested_forward_mode()
-        x, log_a = ctx.saved_tensors
-        return (x_dot - x * log_a_dot) * _SignedLog1p.slope(x, log_a)
+    sign, eps = 2 * (x >= 0).to(x) - 1, torch.finfo(x.dtype).eps
+    size = sign * x  # |x|, with the derivative 1 at 0
+    near = size < eps
+    log_ratio = size.masked_fill(near, 1).log() - log_a
+    far = torch.logaddexp(torch.zeros_like(log_ratio), log_ratio)
+    return sign * torch.where(near, torch.log1p(size / log_a.exp().clamp_min(eps)), far)
 
 
 class _TailMoment(torch.autograd.Function):
@@ -177,7 +134,7 @@ class _TailMoment(torch.autograd.Function):
 
     @staticmethod
     def forward(a: Tensor, k: int) -> tuple[Tensor, Tensor]:
-        if torch.compiler.is_compiling() or a.numel() <= _CHUNK:  # a graph is for batches of any size
+        if a.numel() <= _CHUNK:
             return _tail_moment_and_derivative(k, a)
         # piecewise, so that the arrays of a chunk fit into a processor's cache
         chunks = [_tail_moment_and_derivative(k, chunk) for chunk in a.reshape(-1).split(_CHUNK)]
@@ -200,16 +157,12 @@ class _TailMoment(torch.autograd.Function):
 
     @staticmethod
     def vmap(_: Any, in_dims: tuple[int, None], a: Tensor, k: int) -> tuple[tuple[Tensor, Tensor], tuple[int, int]]:
-        value, derivative = _DualTailMoment.apply(a, k)
+        value, derivative = _TailMoment.apply(a, k)
         return (value, derivative), (in_dims[0], in_dims[0])
 
     @staticmethod
     def derivative(a: Tensor, k: int) -> Tensor:
         return (k + 2) * tail_moment(k + 1, a) / a.square().clamp_min(torch.finfo(a.dtype).tiny)
-
-
-class _DualTailMoment(_TailMoment):
-    """With forward mode, which torch.compile refuses."""
 
     @staticmethod
     def jvp(ctx: Any, a_dot: Tensor, _: None) -> tuple[Tensor, None]:
@@ -225,10 +178,6 @@ def _refuse_nested_forward_mode() -> None:
             "derivatives: got forward mode within forward mode, of which torch ignores one in an autograd.Function; "
             "expected one of them at most; use torch.func.hessian"
         )
-
-
-for _forward in (_SignedLog1p.forward, _TailMoment.forward):  # torch asks for signatures in every call: 15 us
-    vars(_forward)["__signature__"] = inspect.signature(_forward)
 
 
 def _tail_moment_and_derivative(k: int, a: Tensor) -> tuple[Tensor, Tensor]:

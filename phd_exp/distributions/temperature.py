@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from phd_exp.distributions.huber import huber_energy
 from phd_exp.distributions.projected_huber import ProjectedHuber
 from phd_exp.distributions.rounded import depth_law
 
@@ -83,16 +84,16 @@ class Temperature:
         tests/distributions/test_temperature.py.
         """
         xyz = xyz.detach().double()
-        radius = distribution.whiten(xyz).norm(dim=-1).detach().double()
+        q = distribution.whiten(xyz).detach().double()
         log_t = (xyz[..., 2].log() - distribution.mu_z.log()).detach().double()
         log_A, log_a = (u.detach().double().expand_as(log_t) for u in _log_precisions(distribution))
-        for values in (xyz, radius, log_t, log_A, log_a):
+        for values in (xyz, q, log_t, log_A, log_a):
             if values.numel() == 0 or not bool(values.isfinite().all()):
                 raise ValueError(
                     "temperatures are fitted to finite predictions and positions with z > 0, at least one, but "
                     f"{int((~values.isfinite()).sum())} of {values.numel()} numbers are not finite"
                 )
-        projected, projected_slope = _fit(partial(_projected_nll, radius), log_A)
+        projected, projected_slope = _fit(partial(_projected_nll, q), log_A)
         depth, depth_slope = _fit(partial(_depth_nll, log_t, log_a, distribution.rounding), log_a)
         return cls(projected, depth, projected_slope, depth_slope)
 
@@ -109,21 +110,19 @@ def _log_precisions(distribution: ProjectedHuber) -> tuple[Float[Tensor, "*batch
     return distribution.log_det_A / 2, distribution.a.log()
 
 
-def _projected_nll(radius: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
-    """h(r) - 2 v with r = e^v |q|, and its derivative by v; both are convex in v."""
-    r = v.exp() * radius
-    derivative = torch.minimum(r, r.square())
-    return torch.where(r > 1, r - 0.5, derivative / 2) - 2 * v, derivative - 2
+def _projected_nll(q: Tensor, v: Tensor) -> Tensor:
+    """h(e^v |q|) - 2 v; convex in v."""
+    return huber_energy(v.exp()[:, None] * q) - 2 * v
 
 
-def _depth_nll(log_t: Tensor, log_a: Tensor, rounding: float, v: Tensor) -> tuple[Tensor, Tensor]:
-    """-log p(t) at the precision a e^v, and its derivative by v."""
+def _depth_nll(log_t: Tensor, log_a: Tensor, rounding: float, v: Tensor) -> Tensor:
+    """-log p(t) at the precision a e^v."""
     law = depth_law(log_a + v, rounding)
-    return law.energy(log_t) + law.log_normaliser, law.slope(log_t) - law.mean_slope
+    return law.energy(log_t) + law.log_normaliser
 
 
-def _fit(nll: Callable[[Tensor], tuple[Tensor, Tensor]], log_precision: Tensor) -> tuple[float, Slope]:
-    """The typical temperature and its change with the least mean of nll(v), which returns values and derivatives."""
+def _fit(nll: Callable[[Tensor], Tensor], log_precision: Tensor) -> tuple[float, Slope]:
+    """The typical temperature and its change with the least mean of nll(v)."""
     low, high = log_precision.quantile(torch.tensor(_ENDS).double()).tolist()
     slope, bend = Slope(1.0, low, high), Slope(0.0, low, high, 1.0)
     changes = [torch.ones_like(log_precision), *(-one.change(log_precision) for one in (slope, bend))]
@@ -131,9 +130,11 @@ def _fit(nll: Callable[[Tensor], tuple[Tensor, Tensor]], log_precision: Tensor) 
     weight = np.array([0.0, *(1 / (prior**2 * len(log_precision)) for prior in _PRIORS)])
 
     def loss(parameters: Values) -> tuple[float, Values]:
-        value, derivative = nll(torch.from_numpy(parameters) @ by)
-        penalty = weight * parameters
-        return float(value.mean() + penalty @ parameters / 2), (derivative * by).mean(-1).numpy() + penalty
+        leaf, penalty = torch.tensor(parameters, requires_grad=True), weight * parameters
+        with torch.enable_grad():
+            value = nll(leaf @ by).mean()
+            (slope,) = torch.autograd.grad(value, leaf)
+        return value.item() + penalty @ parameters / 2, slope.numpy() + penalty
 
     from scipy.optimize import minimize  # imported slowly, and only fits need it
 

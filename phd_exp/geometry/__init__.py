@@ -25,7 +25,7 @@ from the top left corner of the image; the centre of the pixel in column c and r
 | A_xy | `A_xy` | A / mu_z, precision of (x, y) at any depth | 1 / metres | `distributions.natural.Natural` |
 | nu_xy | `nu_xy` | A_xy mu_xy | 1 / metres | `distributions.natural.Natural` |
 | q | `q` | the whitened projection A_xy (x, y) - nu_xy z + k a (t - 1), independent of t | - | `distributions.projected_huber.ProjectedHuber.whiten` |
-| t | `t` | the relative depth z / mu_z | - | `distributions.depth` |
+| t | `t` | the relative depth z / mu_z | - | `distributions.kinked` |
 | h | `huber_energy` | Huber's function: r^2/2 up to 1, r - 1/2 beyond | - | `distributions.huber.huber_energy` |
 | E_n | `scaled_expint` | generalised exponential integral E_n(a) = int_1^inf e^(-a u) u^(-n) du | - | `distributions.special.scaled_expint` |
 | N | `log_normaliser` | normaliser of the depth law, e^(-a)/a + E_2(a) | - | `distributions.special.log_normaliser` |

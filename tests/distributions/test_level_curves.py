@@ -54,7 +54,7 @@ def test_the_law_of_the_projection_is_constant_along_a_curve(distribution: Proje
         u = torch.from_numpy(curve[::9])
         xyz = torch.cat([u[:, None] * z[:, None], z[:, None].expand(len(u), -1, 1)], dim=-1)
         density = integrate.simpson((distribution.log_prob(xyz).exp() * z**3).numpy(), x=log_z)
-        np.testing.assert_allclose(density, density[0], rtol=1e-3)
+        np.testing.assert_allclose(density, density[0], rtol=3e-3)
 
 
 @pytest.mark.parametrize("distribution", CASES)
@@ -70,7 +70,7 @@ def test_the_law_of_the_birds_eye_view_is_constant_along_a_curve(distribution: P
         x, z = (places[:, None, i].expand_as(y) for i in (0, 1))
         xyz = torch.stack([x, y, z], dim=-1)
         density = integrate.simpson(distribution.log_prob(xyz).exp().numpy(), x=y.numpy())
-        np.testing.assert_allclose(density, density[0], rtol=5e-3)
+        np.testing.assert_allclose(density, density[0], rtol=1e-2)
 
 
 def test_pixels_are_the_cameras() -> None:

@@ -1,33 +1,34 @@
-"""The laws of a distribution, each over the list of instances in conftest.py."""
+"""The Projected Huber density: the paper's formula, the free axis, what is refused, and function transforms.
+
+The laws that it shares with all densities are in test_laws.py.
+"""
 
 import contextlib
 import math
 import subprocess
 import sys
-from collections.abc import Callable
 
+import mpmath as mp
 import pytest
 import torch
-from scipy import stats
 from torch import func
 from torch.autograd import gradcheck
 
 from phd_exp.distributions import ProjectedHuber
+from phd_exp.distributions.columns import distribution_columns, from_columns, parameter_columns
 from phd_exp.distributions.huber import HUBER_COVARIANCE, huber_energy
 from phd_exp.distributions.special import log_normaliser
+from tests.distributions.test_laws import VALUES, N, samples
+from tests.support.densities import FREE, INSTANCES, MU_Z0, F, S, from_raw
 
-N_SAMPLES = 100_000
-
-
-@pytest.fixture(scope="session")
-def samples(distribution: ProjectedHuber) -> torch.Tensor:
-    torch.manual_seed(3)
-    return distribution.sample(torch.Size([N_SAMPLES]))
+PAPERS = {name: one for name, one in INSTANCES.items() if one.k is None}
+every_free_axis = pytest.mark.parametrize("free", FREE.values(), ids=FREE)
 
 
-def test_log_prob_is_the_papers_density(distribution: ProjectedHuber, samples: torch.Tensor) -> None:
+@pytest.mark.parametrize("name", INSTANCES)
+def test_log_prob_is_the_papers_density(name: str) -> None:
     """-log p = h(|q|) + a max(t, 1/t) + log K_proj + log K_depth in the camera frame, as printed; q with k."""
-    xyz = samples[:500]
+    distribution, xyz = INSTANCES[name], samples(name)[:500]
     mu_xy, mu_z, A, a = distribution.mu_xy, distribution.mu_z, distribution.A, distribution.a
     z = xyz[:, 2]
     q = ((xyz[:, :2] / z[:, None] - mu_xy) @ A) * (z / mu_z)[:, None]
@@ -45,84 +46,79 @@ def test_log_prob_is_the_papers_density(distribution: ProjectedHuber, samples: t
     torch.testing.assert_close(distribution.log_prob(xyz), expected, rtol=1e-8, atol=1e-8)
 
 
-def test_mean_and_covariance_are_those_of_samples(distribution: ProjectedHuber, samples: torch.Tensor) -> None:
-    scale = distribution.stddev
-    assert ((samples.mean(0) - distribution.mean) / scale).abs().max() < 0.01
-    difference = torch.cov(samples.T) - distribution.covariance_matrix
-    assert (difference / (scale[:, None] * scale)).abs().max() < 0.02
-    torch.testing.assert_close(distribution.covariance_matrix.diagonal(), distribution.variance)
-    torch.testing.assert_close(distribution.variance[2], distribution.depth_variance)
-    torch.testing.assert_close(distribution.mean[2], distribution.depth_mean)
+@pytest.mark.parametrize("name", INSTANCES)
+def test_entropy_is_minus_the_mean_log_prob(name: str) -> None:
+    log_prob, entropy = INSTANCES[name].log_prob(samples(name)), INSTANCES[name].entropy()
+    assert float(entropy) == pytest.approx(-float(log_prob.mean()), abs=4 * float(log_prob.std()) / math.sqrt(N))
 
 
-def test_projection_has_its_mean_and_covariance(distribution: ProjectedHuber, samples: torch.Tensor) -> None:
-    """E[(x, y)/z] = mu_xy + d (1 - E[1/t]) and Cov = c A^(-2) + Var[1/t] d d^T, where d is 0 without a free axis.
-
-    By E over q and t alone, since (mu_z/z)^2 has heavy tails but mean one.
-    """
-    A_inverse, k = torch.linalg.inv(distribution.A), distribution.k
-    inverse_t = distribution.mu_z / samples[:, 2]
-    mean = distribution.mu_xy
-    expected = HUBER_COVARIANCE * A_inverse @ A_inverse
-    if k is not None:
-        d = -A_inverse @ k * distribution.a
-        mean = mean + d * (1 - inverse_t.mean())
-        expected = expected + d[:, None] * d * inverse_t.var()
+@pytest.mark.parametrize("name", INSTANCES)
+def test_projected_moments_are_those_of_q_and_t(name: str) -> None:
+    """E[(x, y)/z] = mu_xy + d (1 - E[1/t]) and Cov = c A^(-2) + Var[1/t] d d^T, where d is 0 without a free axis."""
+    p, inverse_t = INSTANCES[name], INSTANCES[name].mu_z / samples(name)[:, 2]
+    A_inverse = torch.linalg.inv(p.A)
+    d = torch.zeros(2).double() if p.k is None else -A_inverse @ p.k * p.a
+    expected = HUBER_COVARIANCE * A_inverse @ A_inverse + d[:, None] * d * inverse_t.var()
     scale = expected.diagonal().sqrt()
-    assert ((distribution.projected_mean - mean) / scale).abs().max() < 0.01
-    assert ((distribution.projected_covariance - expected) / (scale[:, None] * scale)).abs().max() < 0.02
-    offset = samples[:, :2] / samples[:, 2:] - distribution.projected_mean
-    near = inverse_t < 50  # what is left out is below 2 % of the covariance
-    sampled = (offset[near, :, None] * offset[near, None, :]).sum(0) / N_SAMPLES
-    assert ((sampled - expected) / (scale[:, None] * scale)).abs().max() < 0.05
+    assert ((p.projected_mean - p.mu_xy - d * (1 - inverse_t.mean())) / scale).abs().max() < 0.015
+    assert ((p.projected_covariance - expected) / (scale[:, None] * scale)).abs().max() < 0.03
+    torch.testing.assert_close(p.covariance_matrix.diagonal(), p.variance)
 
 
-def test_depth_cdf_and_level_of_samples_are_uniform(distribution: ProjectedHuber, samples: torch.Tensor) -> None:
-    z = samples[:, 2]
-    for values in (distribution.depth_cdf(z), distribution.level(samples)):
-        assert stats.kstest(values, "uniform").pvalue > 1e-3
-    assert (z < distribution.depth_median).double().mean().item() == pytest.approx(0.5, abs=0.005)
+@pytest.mark.parametrize("paper", PAPERS.values(), ids=PAPERS)
+def test_without_tilt_every_value_is_the_papers_to_the_last_bit(paper: ProjectedHuber) -> None:
+    free = ProjectedHuber(**paper.parameters, k=torch.zeros(2, dtype=torch.float64), rounding=paper.rounding)
+    paper = ProjectedHuber(**paper.parameters, rounding=paper.rounding)
+    xyz = paper.rsample((200,), torch.Generator().manual_seed(0))
+    for name, (value, _) in VALUES.items():
+        assert torch.equal(value(free, xyz), value(paper, xyz)), name
+    again = (one.rsample((9,), torch.Generator().manual_seed(0)) for one in (free, paper))
+    assert torch.equal(*again)
 
 
-def test_level_orders_positions_as_the_density_does(distribution: ProjectedHuber, samples: torch.Tensor) -> None:
-    xyz = samples[:1000]
-    level, order = distribution.level(xyz), distribution.log_prob(xyz).argsort(descending=True)
-    assert (level[order].diff() >= -1e-9).all()
-    assert distribution.level(distribution.mode) == pytest.approx(0, abs=1e-7)
-    assert distribution.level(distribution.mode * 1e6) == pytest.approx(1, abs=1e-12)
-    assert distribution.level(-distribution.mode) == 1
+@every_free_axis
+def test_moments_are_those_of_30_digits(free: ProjectedHuber) -> None:
+    """E[v] = (E[z] mu_xy + d (E[z] - mu_z), E[z]) and Var[z] m m^T + c A_xy^(-2), m = (mu_xy + d, 1)."""
+    with mp.workdps(60):  # raw moments cancel
+        a, mu_z = mp.mpf(float(free.a)), mp.mpf(float(free.mu_z))
+        M = [mp.expint(j + 2, a) + mp.expint(-j, a) for j in range(3)]
+        mean_z, variance = mu_z * M[1] / M[0], mu_z**2 * (M[2] / M[0] - (M[1] / M[0]) ** 2)
+        A_inverse = mp.matrix(free.A.tolist()) ** -1
+        mu_xy, d = mp.matrix(free.mu_xy.tolist()), -A_inverse * mp.matrix(free.k.tolist()) * a
+        xy = mean_z * mu_xy + d * (mean_z - mu_z)
+        c = (2 + 13 * mp.exp(-mp.mpf(1) / 2)) / (2 * (1 + mp.exp(-mp.mpf(1) / 2)))
+        m = mp.matrix([*(mu_xy + d), 1])
+        covariance = variance * m * m.T
+        covariance[:2, :2] = covariance[:2, :2] + c * mu_z**2 * A_inverse * A_inverse
+        exact = [[float(value) for value in row] for row in covariance.tolist()]
+        mean = [float(v) for v in (*xy, mean_z)]
+    torch.testing.assert_close(free.mean, torch.tensor(mean, dtype=torch.float64), rtol=1e-9, atol=1e-12)
+    torch.testing.assert_close(
+        free.covariance_matrix, torch.tensor(exact, dtype=torch.float64), rtol=1e-7, atol=1e-15
+    )
 
 
-def test_mode_is_a_maximum(distribution: ProjectedHuber) -> None:
-    generator = torch.Generator().manual_seed(6)
-    top = distribution.log_prob(distribution.mode)
-    for size in (1e-6, 1e-3, 0.1, 1.0):
-        step = size * distribution.stddev * torch.randn(200, 3, generator=generator, dtype=torch.float64)
-        assert (distribution.log_prob(distribution.mode + step) <= top).all()
+@every_free_axis
+def test_it_is_the_papers_density_moved_to_the_apex(free: ProjectedHuber) -> None:
+    paper = ProjectedHuber(free.m_xy, free.mu_z, free.A, free.a)
+    xyz = free.rsample((50,), torch.Generator().manual_seed(3))
+    torch.testing.assert_close(free.log_prob(xyz), paper.log_prob(xyz - free.apex))
+    again = ProjectedHuber.about_axis(free.m_xy, free.apex[:2], free.mu_z, free.A, free.a)
+    for name, value in free.parameters.items():
+        torch.testing.assert_close(again.parameters[name], value)
 
 
-def test_entropy_is_minus_the_mean_log_prob(distribution: ProjectedHuber, samples: torch.Tensor) -> None:
-    log_prob = distribution.log_prob(samples)
-    standard_error = (log_prob.std() / math.sqrt(N_SAMPLES)).item()
-    assert distribution.entropy().item() == pytest.approx(-log_prob.mean().item(), abs=4 * standard_error)
-
-
-def test_depth_quantiles_end_at_the_camera_and_at_infinity(distribution: ProjectedHuber) -> None:
-    p = torch.linspace(0.001, 0.999, 99, dtype=torch.float64)
-    torch.testing.assert_close(distribution.depth_cdf(distribution.depth_icdf(p)), p, rtol=1e-8, atol=1e-12)
-    assert (distribution.depth_icdf(0.0), distribution.depth_icdf(1.0)) == (0, torch.inf)
-    behind = torch.tensor([0.0, -1.0, -torch.inf], dtype=torch.float64)
-    assert torch.equal(distribution.depth_cdf(behind), torch.zeros_like(behind))
-
-
-def test_gradients_of_positions(distribution: ProjectedHuber) -> None:
-    scale = 0.3 * distribution.stddev  # offsets in standard deviations, for the step of gradcheck
-    offset = torch.randn(5, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(7))
-
-    def log_prob(offset: torch.Tensor) -> torch.Tensor:
-        return distribution.log_prob(distribution.mode + scale * offset)
-
-    assert gradcheck(log_prob, offset.requires_grad_(), rtol=1e-3, atol=1e-4)
+def test_a_table_has_k_only_with_a_free_axis_and_rebuilds_it() -> None:
+    generator = torch.Generator().manual_seed(4)
+    for numbers in (7, 9):
+        raw = torch.randn(20, numbers, generator=generator, dtype=torch.float64)
+        p = from_raw(raw)
+        xyz = p.rsample((), generator)
+        table = distribution_columns(p, xyz)
+        assert ("k_x" in table) == ("k_y" in table) == (numbers == 9)
+        assert parameter_columns(p).keys() <= table.keys()
+        for name, column in distribution_columns(from_columns(table), xyz).items():
+            torch.testing.assert_close(column, table[name], rtol=1e-6, atol=1e-8)
 
 
 def test_a_sample_is_differentiable() -> None:
@@ -131,62 +127,9 @@ def test_a_sample_is_differentiable() -> None:
 
     def sample(raw: torch.Tensor) -> torch.Tensor:
         torch.manual_seed(9)
-        return ProjectedHuber.from_raw(raw, f=1500.0, S=224.0, mu_z0=2.5e-3).rsample(torch.Size([7]))
+        return ProjectedHuber.from_raw(raw, f=F, S=S, mu_z0=MU_Z0).rsample(torch.Size([7]))
 
     assert gradcheck(sample, raw)
-
-
-@pytest.mark.parametrize("numbers", [7, 9])
-@pytest.mark.parametrize("sample_shape", [(), (5,), (2, 3)])
-def test_shapes_of_a_batch(sample_shape: tuple[int, ...], numbers: int) -> None:
-    """A batch of two images with four points each."""
-    raw = torch.randn(2, 4, numbers, generator=torch.Generator().manual_seed(10))
-    f = torch.tensor([[1200.0], [1800.0]])
-    batch = ProjectedHuber.from_raw(raw, f=f, S=224.0, mu_z0=2.5e-3)
-    assert batch.batch_shape == (2, 4)
-    assert batch.event_shape == (3,)
-    xyz = batch.sample(torch.Size(sample_shape))
-    assert xyz.shape == (*sample_shape, 2, 4, 3)
-    assert batch.log_prob(xyz).shape == batch.level(xyz).shape == (*sample_shape, 2, 4)
-    assert batch.mode.shape == batch.mean.shape == batch.variance.shape == (2, 4, 3)
-    assert batch.covariance_matrix.shape == (2, 4, 3, 3)
-    assert batch.apex.shape == (2, 4, 3)
-    assert batch.mu_xy.shape == batch.m_xy.shape == batch.projected_mean.shape == (2, 4, 2)
-    assert batch.projected_covariance.shape == batch.A.shape == (2, 4, 2, 2)
-    assert batch.entropy().shape == batch.depth_median.shape == batch.log_det_A.shape == (2, 4)
-    torch.testing.assert_close(batch.log_det_A, torch.linalg.slogdet(batch.A).logabsdet, rtol=1e-4, atol=1e-4)
-    one = ProjectedHuber.from_raw(raw[1, 2], f=1800.0, S=224.0, mu_z0=2.5e-3)
-    torch.testing.assert_close(batch.log_prob(xyz)[..., 1, 2], one.log_prob(xyz[..., 1, 2, :]))
-
-
-VALUES = {
-    "log_prob": lambda p, xyz: p.log_prob(xyz),
-    "level": lambda p, xyz: p.level(xyz),
-    "mode": lambda p, xyz: p.mode,
-    "mean": lambda p, xyz: p.mean,
-    "covariance": lambda p, xyz: p.covariance_matrix,
-    "projected mean": lambda p, xyz: p.projected_mean,
-    "projected covariance": lambda p, xyz: p.projected_covariance,
-    "entropy": lambda p, xyz: p.entropy(),
-    "depth_icdf": lambda p, xyz: p.depth_icdf(0.3),
-    "depth_cdf": lambda p, xyz: p.depth_cdf(xyz[..., 2]),
-    "depth_crps": lambda p, xyz: p.depth_crps(xyz[..., 2]),
-    "samples": lambda p, xyz: p.rsample((3,), torch.Generator().manual_seed(0)),
-}
-
-
-@pytest.mark.parametrize("numbers", [7, 9])
-@pytest.mark.parametrize("value", VALUES.values(), ids=VALUES.keys())
-def test_an_empty_batch_gives_empty_values(
-    value: Callable[[ProjectedHuber, torch.Tensor], torch.Tensor], numbers: int
-) -> None:
-    empty = ProjectedHuber.from_raw(torch.zeros(0, numbers), f=1500.0, S=224.0, mu_z0=2.5e-3)
-    one = ProjectedHuber.from_raw(torch.zeros(1, numbers), f=1500.0, S=224.0, mu_z0=2.5e-3)
-    shape = value(one, torch.ones(1, 3)).shape
-    nothing = value(empty, torch.ones(0, 3))
-    assert nothing.shape == torch.Size([0 if size == 1 else size for size in shape])
-    again = ProjectedHuber(**empty.parameters)
-    assert again.batch_shape == (0,)
 
 
 @pytest.mark.parametrize("numbers", [7, 9])
@@ -198,11 +141,11 @@ def test_what_passes_validation_gives_finite_values(size: float, dtype: torch.dt
     passed = []
     for raw in size * signs.to(dtype):
         with contextlib.suppress(ValueError):
-            ProjectedHuber.from_raw(raw, f=1500.0, S=224.0, mu_z0=2.5e-3)
+            ProjectedHuber.from_raw(raw, f=F, S=S, mu_z0=MU_Z0)
             passed.append(raw)
-    distribution = ProjectedHuber.from_raw(torch.stack(passed), f=1500.0, S=224.0, mu_z0=2.5e-3)
+    distribution = ProjectedHuber.from_raw(torch.stack(passed), f=F, S=S, mu_z0=MU_Z0)
     xyz = torch.tensor([0.1, -0.2, 4.0], dtype=dtype)
-    for name, value in VALUES.items():
+    for name, (value, _) in VALUES.items():
         assert value(distribution, xyz).isfinite().all(), name
 
 
@@ -216,7 +159,7 @@ def test_function_transforms_work_through_the_loss(raw: torch.Tensor) -> None:
     raw = raw.double()
 
     def loss(raw: torch.Tensor, xyz: torch.Tensor) -> torch.Tensor:
-        distribution = ProjectedHuber.from_raw(raw, f=1500.0, S=224.0, mu_z0=2.5e-3, validate_args=False)
+        distribution = ProjectedHuber.from_raw(raw, f=F, S=S, mu_z0=MU_Z0, validate_args=False)
         return -distribution.log_prob(xyz)
 
     expected = torch.autograd.functional.jacobian(lambda raw: loss(raw, xyz), raw)
@@ -246,7 +189,7 @@ def test_positions_behind_the_camera_or_at_infinity_have_no_density_and_no_gradi
     nowhere = [[0.0, 0.0, -1.0], [0.1, 0.2, 0.0], [0.0, 0.0, inf], [0.1, -inf, 2.0], [inf, inf, inf]]
     xyz = torch.tensor([*nowhere, [0.0, 0.0, 1.0]], requires_grad=True)
     raw = torch.zeros(7, requires_grad=True)
-    distribution = ProjectedHuber.from_raw(raw, f=1500.0, S=224.0, mu_z0=2.5e-3)
+    distribution = ProjectedHuber.from_raw(raw, f=F, S=S, mu_z0=MU_Z0)
     log_prob = distribution.log_prob(xyz)
     assert log_prob.tolist()[:-1] == [-inf] * len(nowhere)
     assert distribution.level(xyz).tolist()[:-1] == [1] * len(nowhere)

@@ -10,13 +10,13 @@ from torch import Tensor, nn
 
 from phd_exp.config import check
 from phd_exp.distributions import Mixture, Temperature
-from phd_exp.distributions.constraints import families
 from phd_exp.distributions.temperature import Slope
 from phd_exp.geometry import Camera, Cartesian, Chart, DepthScale, LogDepth, Projected
 from phd_exp.inference.deployed import OfPhotographs, answers, require_exportable
 from phd_exp.inference.predictor import Predictor
 from phd_exp.models.heads import ChartHead, DistributionHead, Head, MixtureHead, SurrogateHead
 from phd_exp.records.errors import ConfigError
+from tests.support.densities import BASELINES, SHAPED, predicted, raw_numbers
 from tests.support.portable import NoChoiceOfTruths, openvino_outputs, require_portable
 from tests.support.raw_numbers import hostile
 
@@ -55,7 +55,7 @@ def images_of(rows: np.ndarray) -> np.ndarray:
 def draws(n: int, extreme: int) -> Tensor:
     """Raw numbers throughout the documented range, then at its ends."""
     generator = torch.Generator().manual_seed(0)
-    return torch.cat([families()["free_axis"].inputs(n, generator), hostile(extreme, generator)])
+    return torch.cat([raw_numbers("free_axis", n, generator), hostile(extreme, generator)])
 
 
 def predictor(composed: Callable[..., Any], head: Head, numbers: Tensor, **changes: Any) -> Predictor:
@@ -133,15 +133,14 @@ def test_float32_has_the_digits_of_float64(name: str) -> None:
     require_accurate(dict(zip(there, deviations(*values), strict=True)))
 
 
-OTHERS = set(families()) - {"probabilistic", "free_axis", "gaussian_mixture"}
+OTHERS = {*SHAPED, *BASELINES, "rounded_t"} - {"gaussian_mixture"}
 
 
 @pytest.mark.parametrize("name", sorted(OTHERS))
 def test_float32_has_the_digits_of_float64_in_the_modes_of_other_densities(name: str) -> None:
-    family = families()[name]
-    raw = family.inputs(10_000, torch.Generator().manual_seed(0)).float()
+    raw = raw_numbers(name, 10_000, torch.Generator().manual_seed(0)).float()
     f = torch.linspace(600, 2000, len(raw))
-    found = (family.predict(raw.to(dtype), Camera(f.to(dtype), 224.0)) for dtype in (torch.float32, torch.float64))
+    found = (predicted(name, raw.to(dtype), Camera(f.to(dtype), 224.0)) for dtype in (torch.float32, torch.float64))
     here, there = (getattr(one, "estimate", one).mode.numpy() for one in found)
     assert deviations([here], [there])[0].max() < 1e-5
 
@@ -170,7 +169,7 @@ def test_the_distribution_is_that_of_torch_in_every_runtime(composed: Callable[.
 @pytest.mark.slow
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 def test_a_rounded_mode_is_that_of_torch(composed: Callable[..., Any], precision: str) -> None:
-    numbers = families()["rounded_t"].inputs(1_000, torch.Generator().manual_seed(0))
+    numbers = raw_numbers("rounded_t", 1_000, torch.Generator().manual_seed(0))
     made = predictor(composed, HEADS["rounded"], numbers, temperature=TEMPERATURE)
     images, f = images_of(np.arange(len(numbers))), np.linspace(2, 9, len(numbers), dtype=np.float32) * SIDE
     model = exported(made, precision=precision)
@@ -191,7 +190,7 @@ def disagreeing(raw: Tensor, widths: float, members: int) -> Tensor:
 @pytest.mark.parametrize(("n_outputs", "rounding"), [(7, 0.0), (9, 0.0), (9, 2.0)])
 def test_float32_has_the_digits_of_float64_in_ensembles(widths: float, n_outputs: int, rounding: float) -> None:
     """Of eight members, for which digits cancel most where they are equal."""
-    raw = families()["free_axis"].inputs(1_000, torch.Generator().manual_seed(0))
+    raw = raw_numbers("free_axis", 1_000, torch.Generator().manual_seed(0))
     raw = disagreeing(raw, widths, 8)[..., :n_outputs]
     f, head = torch.linspace(2, 9, len(raw))[:, None] * SIDE, DistributionHead(DEPTH, free_axis=n_outputs == 9)
     with NoChoiceOfTruths():

@@ -13,9 +13,7 @@ import pytest
 from markdown_it import MarkdownIt
 from rich.console import Console
 
-from phd_exp.distributions.constraints import Finding
 from phd_exp.reports.files import all_tables, latex, markdown, run_lines, tidy
-from phd_exp.reports.heads_table import constraints_table
 from phd_exp.reports.runs import Report, Run, read_report
 from phd_exp.reports.table import Table, TableCell
 from phd_exp.reports.terminal import WIDTH, print_report
@@ -96,17 +94,6 @@ def test_markdown_parses_to_the_same_cells(found: list[Table]) -> None:
         assert commands == ([table.command] if table.command else [])
     assert any("script" in line for table in found for line in table.gaps)
     assert any("`" in table.command for table in found)
-
-
-def test_the_constraints_are_a_markdown_table() -> None:
-    measured = {
-        "3 p = 0 behind": {"mae_vz": Finding(False, 36.04), "mae_logz": Finding(True, 0.0)},
-        "5 -log p convex": {"mae_vz": Finding(False, 1.72), "mae_logz": Finding(False, 1.8e9)},
-    }
-    html = MarkdownIt("gfm-like", {"linkify": False}).render(markdown(constraints_table(measured)))
-    assert html.count("<tr>") == 3
-    for shown in ("mae_vz", "<strong>breaks</strong> (36)", "holds (0)", "(1.8e+09)", "5 -log p convex"):
-        assert shown in html
 
 
 # LaTeX

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from phd_exp.distributions import ProjectedHuber
-from phd_exp.distributions.depth_law import Kinked
+from phd_exp.distributions.kinked import Kinked
 from phd_exp.fusion import Pose
 
 CANDIDATES = 400
