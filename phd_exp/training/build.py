@@ -25,8 +25,7 @@ from phd_exp.records.errors import ConfigError, RunError
 from phd_exp.records.runs import RunFolder
 from phd_exp.training.cameras import CameraPolicy
 from phd_exp.training.module import PositionModule
-from phd_exp.training.objective import Objective
-from phd_exp.training.optimisation import Optimisation, factor
+from phd_exp.training.objective import Objective, factor
 
 EXCHANGED = {"backdrops", "plain", "prints"}  # shares of a recipe's augmentation that are arguments of `PositionData`
 
@@ -97,7 +96,8 @@ def build_module(config: RunConfig, data: PositionData) -> PositionModule:
         regressor,
         Objective(loss, recipe.localisation, recipe.segmentation),
         CameraPolicy(constant_f, config.camera.f_error),
-        Optimisation(optimizer, partial(factor, recipe.schedule, recipe.warmup_steps)),
+        optimizer,
+        partial(factor, recipe.schedule, recipe.warmup_steps),
     )
     if custom_parts({"head": config.model.head, "backbone": config.backbone, "loss": config.loss}):
         _try_out(module, config, data.source)

@@ -61,9 +61,11 @@ def at_home(content: Any, checkpoints: Path) -> Any:
         >>> at_home({"best": "/old/checkpoints/best.ckpt", "monitor": "held_out/loss"}, Path("checkpoints"))
         {'best': 'checkpoints/best.ckpt', 'monitor': 'held_out/loss'}
     """
-    if isinstance(content, str) and _is_path(content):
-        name = Path(content).name
-        return str(checkpoints if name in ("..", checkpoints.name) else checkpoints / name)
+    if isinstance(content, str):
+        leads_away = content.startswith(("/", "~")) or "://" in content or ".." in Path(content).parts
+        if leads_away or os.path.isfile(content):  # a single word that names a folder here may be anything else
+            name = Path(content).name
+            return str(checkpoints if name in ("..", checkpoints.name) else checkpoints / name)
     if isinstance(content, dict):  # in place, which keeps its class
         changed = {at_home(key, checkpoints): at_home(value, checkpoints) for key, value in content.items()}
         content.clear()
@@ -73,22 +75,12 @@ def at_home(content: Any, checkpoints: Path) -> Any:
     return content
 
 
-def _is_path(text: str) -> bool:
-    """Whether a text leads from a root or a home, by an address, upwards, or to something that exists.
-
-    A single word that is the name of a folder here, such as `test`, may be anything else.
-    """
-    if text.startswith(("/", "~")) or "://" in text or ".." in Path(text).parts:
-        return True
-    return os.path.isfile(text) or ("/" in text and os.path.lexists(text))
-
-
 class StopBetweenBatches(Checkpoint):
     """Delays a SIGINT or SIGTERM to the end of the batch, saves a checkpoint, and raises the signal again.
 
-    The handlers that were installed before the training receive it. During the last batch and the validation the
-    signal waits for the checkpoint of the epoch: as a Checkpoint callback this one runs in the order of the Trainer's
-    list, and belongs after ModelCheckpoint. A second signal is raised at once.
+    During the last batch and the validation the signal waits for the checkpoint of the epoch: as a Checkpoint callback
+    this one runs in the order of the Trainer's list, and belongs after ModelCheckpoint. A second signal is raised at
+    once. The handlers that were installed before the training receive it.
     """
 
     def __init__(self, checkpoint: Path) -> None:
@@ -104,29 +96,24 @@ class StopBetweenBatches(Checkpoint):
         # after the last batch of an epoch its validation follows, and the checkpoint of the whole epoch
         if self.received is not None and not trainer.is_last_batch:
             trainer.save_checkpoint(self.checkpoint)
-            self._raise()
+            self._raise(self.received)
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if self.received is not None:
-            self._raise()
+            self._raise(self.received)
 
-    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        self._restore()
-
-    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
-        self._restore()
-
-    def _receive(self, signum: int, frame: FrameType | None) -> None:
-        if self.received is not None:
-            self._raise()
-        self.received = signum
-
-    def _raise(self) -> None:
-        assert self.received is not None
-        self._restore()
-        signal.raise_signal(self.received)
-
-    def _restore(self) -> None:
+    def on_train_end(self, *arguments: Any) -> None:
         for signum, handler in self.handlers.items():
             signal.signal(signum, handler)
         self.handlers = {}
+
+    on_exception = on_train_end
+
+    def _receive(self, signum: int, frame: FrameType | None) -> None:
+        if self.received is not None:
+            self._raise(signum)
+        self.received = signum
+
+    def _raise(self, signum: int) -> None:
+        self.on_train_end()
+        signal.raise_signal(signum)

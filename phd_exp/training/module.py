@@ -1,13 +1,15 @@
 """The LightningModule with which all models are trained."""
 
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import torch
 import torch.distributed as dist
 from lightning import LightningModule
 from lightning.pytorch.utilities.types import OptimizerLRScheduler
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn.utils import clip_grad_norm_, clip_grad_value_
+from torch.optim.lr_scheduler import LambdaLR
 
 from phd_exp.data.batches import Batch
 from phd_exp.losses import NegativeLogLikelihood
@@ -17,7 +19,6 @@ from phd_exp.models.regressor import Regressor
 from phd_exp.records.errors import RunError, listed
 from phd_exp.training.cameras import CameraPolicy, f_factor
 from phd_exp.training.objective import Objective, natural_loss
-from phd_exp.training.optimisation import Optimisation
 from phd_exp.training.predictions import columns, summary, training_columns
 
 UNREAD = 50  # steps whose losses are read together
@@ -33,7 +34,8 @@ class PositionModule(LightningModule):
         regressor: image and camera -> prediction.
         objective: what training minimises; None: the `natural_loss` of the predictions.
         camera: the cameras that the model receives.
-        optimisation: the optimizer and its schedule.
+        optimizer: parameters -> optimizer.
+        schedule: number of steps -> factor of the learning rate at each; see `factor`. None: it is constant.
 
     Attributes:
         evaluation_rows: rows of the test samples of an evaluation, see `training.predictions.columns`.
@@ -44,14 +46,16 @@ class PositionModule(LightningModule):
         regressor: Regressor,
         objective: Objective | None = None,
         camera: CameraPolicy | None = None,
-        optimisation: Optimisation | None = None,
+        optimizer: Callable[[Iterable[nn.Parameter]], torch.optim.Optimizer] = torch.optim.Adam,
+        schedule: Callable[[int], Callable[[int], float]] | None = None,
     ) -> None:
         super().__init__()
         self.regressor = regressor
         self.objective = objective or Objective(natural_loss(regressor.head.prediction))
         self.loss = self.objective.loss  # a module among others, whose buffers move to the GPU
         self.camera = camera or CameraPolicy()
-        self.optimisation = optimisation or Optimisation()
+        self.optimizer = optimizer
+        self.schedule = schedule or (lambda steps: lambda step: 1.0)
         self.training_rows, self.evaluation_rows, self.held_out_rows = Rows(), Rows(), Rows()
         self.unread: list[tuple[str, Tensor, Tensor, Tensor]] = []
 
@@ -59,7 +63,9 @@ class PositionModule(LightningModule):
         return self.regressor(batch.image, self.camera(batch))
 
     def configure_optimizers(self) -> OptimizerLRScheduler:
-        return self.optimisation(self.regressor.parameters(), int(self.trainer.estimated_stepping_batches))
+        optimizer = self.optimizer(self.regressor.parameters())
+        scheduler = LambdaLR(optimizer, self.schedule(int(self.trainer.estimated_stepping_batches)))
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
 
     def configure_gradient_clipping(
         self, optimizer: Any, gradient_clip_val: float | None = None, gradient_clip_algorithm: str | None = None

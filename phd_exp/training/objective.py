@@ -1,5 +1,6 @@
-"""What a training minimises: the loss of the predictions, and those of the backbone's maps."""
+"""What a training minimises, and the schedule of its learning rate."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -20,7 +21,7 @@ Loss = Callable[[Prediction, Tensor], Tensor]
 
 @dataclass(frozen=True)
 class Objective:
-    """The mean loss, and the weighted losses of the maps.
+    """The mean loss, and the weighted losses of the backbone's maps.
 
     Attributes:
         loss: of the predictions.
@@ -46,3 +47,22 @@ class Objective:
 def natural_loss(prediction: type) -> Loss:
     """The negative log likelihood of a density, the mean absolute error of a point estimate."""
     return NegativeLogLikelihood() if issubclass(prediction, Density) else MeanAbsoluteError()
+
+
+def factor(schedule: str, warmup_steps: int, steps: int) -> Callable[[int], float]:
+    """Step -> factor of the optimizer's learning rate, in a run of `steps` steps.
+
+    It rises linearly over the first `warmup_steps`. Then "constant" stays; "cosine" falls to zero as half a wave.
+
+    Examples:
+        >>> at = factor("cosine", warmup_steps=1, steps=100)
+        >>> [round(at(step), 3) for step in (0, 50, 100)]
+        [0.5, 0.5, 0.0]
+    """
+
+    def at(step: int) -> float:
+        rise = min(1.0, (step + 1) / (warmup_steps + 1))
+        fall = (1 + math.cos(math.pi * min(step / steps, 1.0))) / 2 if schedule == "cosine" else 1.0
+        return rise * fall
+
+    return at

@@ -1,6 +1,5 @@
 """Lightning's Trainer for a run: its arguments, its callbacks, and those of the user."""
 
-import sys
 from collections.abc import Mapping, Sequence
 from inspect import signature
 from typing import Any
@@ -53,9 +52,10 @@ def build_trainer(config: RunConfig, recorder: Recorder, callbacks: Sequence[Cal
     ]
     if config.trainer.devices == 1:  # several processes would stop at different batches
         ours.append(StopBetweenBatches(folder.last_checkpoint))
-    if config.trainer.progress_bar:
-        ours.append(Progress(sys.stderr.isatty(), config.preset))
-    every = [*ours, *build_callbacks(config.callbacks, folder), *callbacks]
+    theirs = [*build_callbacks(config.callbacks, folder), *callbacks]
+    has_bar = any(isinstance(callback, ProgressBar) for callback in theirs)
+    if config.trainer.progress_bar and not has_bar:
+        ours.append(Progress())
     arguments: dict[str, Any] = {
         "accelerator": config.trainer.accelerator,
         "devices": config.trainer.devices,
@@ -65,8 +65,8 @@ def build_trainer(config: RunConfig, recorder: Recorder, callbacks: Sequence[Cal
         "precision": precision(config.trainer.accelerator, config.trainer.precision),
         "max_epochs": config.trainer.max_epochs,
         "logger": list(recorder.loggers),
-        "callbacks": every,
-        "enable_progress_bar": any(isinstance(callback, ProgressBar) for callback in every),  # one of the user
+        "callbacks": [*ours, *theirs],
+        "enable_progress_bar": config.trainer.progress_bar or has_bar,
         "check_val_every_n_epoch": config.evaluation.every_n_epochs,
         "log_every_n_steps": 1,  # avoids a warning; metrics are logged once an epoch
         "enable_model_summary": False,

@@ -76,7 +76,7 @@ class Bare:
 
     def __init__(self, module: PositionModule, samples: Batch, config: RunConfig) -> None:
         self.regressor, self.loss = copy.deepcopy(module.regressor), module.loss
-        self.optimizer = module.optimisation.optimizer(self.regressor.parameters())
+        self.optimizer = module.optimizer(self.regressor.parameters())
         self.samples, self.batch_size = samples, config.data.batch_size
         self.mixed = precision(config.trainer.accelerator, config.trainer.precision) == "bf16-mixed"
 

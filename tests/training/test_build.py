@@ -25,7 +25,7 @@ from phd_exp.inference import tables
 from phd_exp.records.errors import ConfigError, RunError
 from phd_exp.records.runs import RunFolder
 from phd_exp.training.build import build_data, build_module
-from phd_exp.training.optimisation import factor
+from phd_exp.training.objective import factor
 from phd_exp.training.recorder import has_curves
 from phd_exp.training.train import require_same_photometry
 
@@ -151,7 +151,7 @@ def test_a_training_step_and_its_data_read_nothing_back(checked: Callable, words
     config = checked("recipe=strong", "photometry=robust", "backbone.width=8", "backbone.channels=4", *words)
     data = build_data(config)
     module, n = build_module(config, data), 4
-    optimizer = module.optimisation.optimizer(module.regressor.parameters())
+    optimizer = module.optimizer(module.regressor.parameters())
     image, mask = torch.zeros(n, 64, 64, 3, dtype=torch.uint8), torch.zeros(n, 28, 28, dtype=torch.uint8)
     batch = Batch(
         image, torch.tensor([[0.0, 0.0, 4.0]]).expand(n, 3), torch.full((n,), 400.0), 64.0, torch.arange(n), mask
