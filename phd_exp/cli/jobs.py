@@ -38,8 +38,6 @@ class Job:
         task: takes the resolved configuration, its overrides and the number of cores; returns the score, if any.
         standing: the state on disk of the job with a configuration and overrides: "finished", "running" (in any
             process), the error that ended it, or None without a record. None if the verb records nothing.
-        cost: the seconds of the jobs with these configurations, one after another, on that many cores; 0 if it is not
-            known. None if the verb cannot estimate it.
         numbers: the results on disk of the finished job with a configuration and overrides, in words. None if the
             verb has none.
         endings: of all jobs, in the launcher's own process.
@@ -52,7 +50,6 @@ class Job:
 
     task: Callable[[dict[str, Any], list[str], int], float | None]
     standing: Callable[[dict[str, Any], list[str]], str | None] | None = None
-    cost: Callable[[list[dict[str, Any]], int], float] | None = None
     numbers: Callable[[dict[str, Any], list[str]], str] | None = None
     endings: list[Ending] = field(default_factory=list)
     n_jobs: int = 1

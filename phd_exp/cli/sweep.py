@@ -27,7 +27,7 @@ from phd_exp.cli.frame import RESUMES, Ending, print_errors
 from phd_exp.cli.jobs import Job, plain
 from phd_exp.cli.words import explain
 from phd_exp.records.errors import ConfigError, RunError
-from phd_exp.records.processes import duration, usable_cores
+from phd_exp.records.processes import usable_cores
 
 MOST_JOBS = 10_000
 SECONDS_BETWEEN_LOOKS = 1.0
@@ -49,8 +49,6 @@ def sweep(job: Job, config: DictConfig, context: HydraContext, arguments: list[s
     finished = [job.standing is not None and job.standing(*combination) == "finished" for combination in jobs]
     tail = f", {sum(finished)} of them finished already" if job.standing else ""
     print(f"{_counted(len(jobs))}{tail}", flush=True)
-    left = [combination.config for before, combination in zip(finished, jobs, strict=True) if not before]
-    _print_duration(job, left, cores_a_job(plain(master.hydra.launcher), len(jobs)))
     endings = [
         ending._replace(state="finished already") if before and ending.exit_status == 0 else ending
         for before, ending in zip(finished, _run(job, master, jobs, context), strict=True)
@@ -58,14 +56,6 @@ def sweep(job: Job, config: DictConfig, context: HydraContext, arguments: list[s
     _print_outcome(job, jobs, endings)
     job.endings.extend(endings)
     return [ending.value for ending in endings]
-
-
-def _print_duration(job: Job, left: list[dict[str, Any]], cores_of_one: int | None) -> None:
-    """Print how long the jobs take together, if that can be estimated."""
-    cores = usable_cores()
-    if job.cost and left and (seconds := job.cost(left, cores_of_one or cores)):
-        seconds /= cores // (cores_of_one or cores)
-        print(f"about {duration(seconds)} on {cores} cores, by the first steps of one job", flush=True)
 
 
 def _run(job: Job, master: DictConfig, jobs: list[Combination], context: HydraContext) -> list[Ending]:

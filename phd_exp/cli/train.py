@@ -43,12 +43,11 @@ SUMMARY = {
     "test/nll": "NLL {}",
 }
 """The numbers of each run at the end of a sweep."""
-LONG = 1_000_000  # images seen by all trainings of a sweep; from here on their time is estimated
 
 
 def main(words: list[str]) -> int:
     """Train once, or (-m) for every combination; returns the exit status."""
-    return launch(Job(task, standing, cost, numbers), words)
+    return launch(Job(task, standing, numbers), words)
 
 
 def task(config: dict[str, Any], overrides: list[str], cores: int, callbacks: Sequence[Any] = ()) -> float | None:
@@ -90,35 +89,6 @@ def trained(overrides: Sequence[str], config_dir: str | Path | None) -> "Trained
     config = composed(words, config_dir)
     task(config, words, usable_cores())
     return TrainedRun(run_name(checked_start(config, words), words).folder(Path(config["runs"])))
-
-
-def cost(configs: list[dict[str, Any]], cores: int) -> float:
-    """The seconds of several long trainings on a CPU, one after another, by the first steps of the first; else 0.
-
-    Rendering and evaluations are not included.
-    """
-    images = [_images_seen(config) for config in configs]
-    if sum(images) < LONG:
-        return 0.0
-    try:
-        # words for the network change nothing here: it must be that of the start
-        first = checked_start(configs[0], [])
-    except (ConfigError, RunError):  # the job itself reports it
-        return 0.0
-    from phd_exp.hardware import has_gpu
-    from phd_exp.training.duration import seconds_a_step
-
-    if has_gpu(first.trainer.accelerator) or not isinstance(first.data, RenderedConfig):
-        return 0.0
-    return seconds_a_step(first, cores) / first.data.batch_size * sum(images)
-
-
-def _images_seen(config: dict[str, Any]) -> int:
-    """The number of images that a training sees, 0 if it is unknown. The configuration is not checked."""
-    try:
-        return int(config["data"]["n_train"]) * int(config["trainer"]["max_epochs"])
-    except (KeyError, TypeError, ValueError):
-        return 0
 
 
 def announce(checked: RunConfig, folder: RunFolder, overrides: list[str]) -> None:

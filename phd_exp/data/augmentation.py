@@ -10,8 +10,8 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from phd_exp.data.batches import SIGNS, Batch
-from phd_exp.data.photometry import Photometry, blocks, levels, on
-from phd_exp.geometry.camera import Camera, middles
+from phd_exp.data.photometry import Photometry, levels, on
+from phd_exp.geometry.camera import middles
 from phd_exp.geometry.motion import Motion, small_turns, symmetries
 
 TURN, COLOURS = 4, 3  # numbers of a rotation and zoom, and of an order of the channels
@@ -88,15 +88,11 @@ def moved(batch: Batch, motion: Motion) -> Batch:
 
     def resampled(images: UInt8[Tensor, "batch side side channels"]) -> UInt8[Tensor, "batch side side channels"]:
         side = images.shape[1]
-        grid = middles(side, side).to(batch.f)
-        parts = []
-        for block in blocks(images, len(images)):
-            camera = Camera.unchecked(batch.f[block], batch.S)
-            origin = Motion(motion.R[block], motion.zoom[block]).origin(grid, camera)
-            part = images[block].permute(0, 3, 1, 2).to(origin.dtype)
-            values = grid_sample(part, origin, padding_mode="border", align_corners=False)
-            parts.append(levels(values).permute(0, 2, 3, 1))
-        return torch.cat(parts)
+        origin = motion.origin(middles(side, side).to(batch.f), batch.camera)
+        values = grid_sample(
+            images.permute(0, 3, 1, 2).to(origin.dtype), origin, padding_mode="border", align_corners=False
+        )
+        return levels(values).permute(0, 2, 3, 1).contiguous()
 
     mask = None if batch.mask is None else resampled(batch.mask[..., None])[..., 0]
     return replace(

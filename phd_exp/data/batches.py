@@ -1,7 +1,6 @@
 """Batches of a data set in memory, in an order that depends on (seed, epoch) alone."""
 
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol, runtime_checkable
 
@@ -51,13 +50,14 @@ class Batch:
         place = rows.to(self.image.device, non_blocking=True)
         return self._map(lambda part: part.index_select(0, place))  # on a CPU, twenty times as fast as part[place]
 
-    def to(self, device: torch.device | str, non_blocking: bool = False) -> "Batch":
+    def to(self, device: torch.device | str) -> "Batch":
         """The same samples on a device."""
-        return self._map(lambda part: part.to(device, non_blocking=non_blocking))
+        return self._map(lambda part: part.to(device))
 
-    def pinned(self) -> "Batch":
-        """The same samples in page-locked memory, from which a GPU copies while it computes."""
-        return self._map(Tensor.pin_memory)
+    def copied(self, device: torch.device) -> "Batch":
+        """The same samples on another device; a GPU copies from page-locked memory while it computes."""
+        part = self._map(Tensor.pin_memory) if device.type == "cuda" else self
+        return part._map(lambda part: part.to(device, non_blocking=True))
 
     @property
     def n_bytes(self) -> int:
@@ -84,6 +84,37 @@ class Augment(Protocol):
         ...
 
 
+@dataclass(frozen=True, eq=False)
+class Exchange:
+    """An augmentation that first changes a share of the samples by means of a stock of images.
+
+    Args:
+        stock: the images that replace others.
+        change: (stock, batch, which samples to change, numbers from 0 to 1 of each sample) -> the changed batch.
+        n_own: random numbers per sample: one decides whether it changes, `change` uses the others.
+        share: the share of the samples that change.
+        then: the augmentation that follows.
+    """
+
+    stock: Any
+    change: Callable[[Any, Batch, np.ndarray, np.ndarray], Batch]
+    n_own: int
+    share: float
+    then: Augment | None
+
+    @property
+    def n_numbers(self) -> int:
+        """Number of random numbers per sample; those of `then` come first."""
+        return self.n_own + (self.then.n_numbers if self.then else 0)
+
+    def __call__(self, batch: Batch, numbers: Float[Tensor, "batch n_numbers"]) -> Batch:
+        """The samples, changed by uniform numbers from -1 to 1; their `row` is that of the originals."""
+        of_then, own = numbers.tensor_split([-self.n_own], dim=1)
+        uniform = ((own + 1) / 2).numpy()
+        batch = self.change(self.stock, batch, uniform[:, 0] < self.share, uniform[:, 1:])
+        return self.then(batch, of_then) if self.then else batch
+
+
 @dataclass(eq=False)
 class BatchLoader:
     """Iterates over the batches of one epoch; each iteration is the next epoch.
@@ -99,8 +130,7 @@ class BatchLoader:
     for the whole batch, so they do not depend on `world`. The signs of the first three numbers of a row are
     stratified: within eight epochs each row gets all eight combinations.
 
-    Batches are on `device`, where `augment` works. If the samples are elsewhere, the next batch is selected and
-    copied in a thread while the last one is in use.
+    Batches are on `device`, where `augment` works; samples elsewhere are copied batch by batch.
 
     Examples:
         >>> n = 4
@@ -135,23 +165,13 @@ class BatchLoader:
         order = self.order(self.epoch)
         signs = self.signs(self.epoch) if self.augment else np.empty(0)
         starts = range(self.next_batch * self.batch_size, len(self) * self.batch_size, self.batch_size)
-        rows = [order[start : start + self.batch_size] for start in starts]
-        for of_batch, batch in zip(rows, self._selected(rows), strict=True):
-            number = self.next_batch
+        for start in starts:
+            rows, number = order[start : start + self.batch_size], self.next_batch
+            batch = self.samples.select(rows[self.rank :: self.world])
+            if self.device != batch.image.device:
+                batch = batch.copied(self.device)
             self.next_batch += 1
-            yield self._augmented(batch, number, of_batch, signs) if self.augment else batch
-
-    def _selected(self, rows: Iterable[Int[Tensor, " _"]]) -> Iterator[Batch]:
-        """The samples of this process in batches of these rows, on the device."""
-        mine = [of_batch[self.rank :: self.world] for of_batch in rows]
-        if self.samples.image.device == self.device:
-            yield from map(self.samples.select, mine)
-        else:
-            yield from one_ahead(self._copied, mine)
-
-    def _copied(self, rows: Int[Tensor, " rows"]) -> Batch:
-        batch = self.samples.select(rows)
-        return (batch.pinned() if self.device.type == "cuda" else batch).to(self.device, non_blocking=True)
+            yield self._augmented(batch, number, rows, signs) if self.augment else batch
 
     def _augmented(
         self, batch: Batch, number: int, rows: Int[Tensor, " batch"], signs: Int[np.ndarray, "samples 3"]
@@ -187,16 +207,3 @@ class BatchLoader:
         """Continue the next iteration at this position."""
         self.epoch, self.next_batch = state_dict["epoch"], state_dict["next_batch"]
         self.resumes = 0 < self.next_batch < len(self)
-
-
-def one_ahead(make: Callable[[Any], Batch], arguments: Iterable[Any]) -> Iterator[Batch]:
-    """make(argument) for each in order; the next is made in a thread while the last is in use."""
-    with ThreadPoolExecutor(1) as thread:
-        waiting = None
-        for argument in arguments:
-            following = thread.submit(make, argument)
-            if waiting:
-                yield waiting.result()
-            waiting = following
-        if waiting:
-            yield waiting.result()

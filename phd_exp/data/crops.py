@@ -1,7 +1,6 @@
 """Reading the user's own images, and resampling them to the views of virtual cameras."""
 
 import io
-from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -26,8 +25,6 @@ TWELVE_BITS = 1 << 12
 ONE_PICTURE = ("JPEG", "MPO")  # formats whose further frames are previews and depth maps
 STRIP = 1 << 17  # about the pixels of the image that a strip of a view reads; the sums of three bands take 3 MB
 WIDEST = 100.0  # m that the view of an object may show at its distance
-NODES = 16  # Chebyshev points along a side of a view, between which the corners of its pixels are interpolated
-CLOSE = 1e-9  # largest error of interpolated corners, px
 MARGIN = 1  # pixels around a view of more pixels than the image has, which are interpolated
 
 
@@ -131,28 +128,8 @@ def cut(image: Picture, camera: VirtualCamera) -> UInt8[np.ndarray, "S S 3"]:
 
 
 def corners_of(camera: VirtualCamera) -> Float[np.ndarray, "places places 2"]:
-    """Pixels of the real image at the corners of the pixels of the virtual image.
-
-    A lens takes long, so the corners are interpolated by polynomials through Chebyshev points. If these err by more
-    than `CLOSE` halfway between the points, as at the edge of the field, each corner is computed.
-    """
-    coarse = np.moveaxis(camera.grid(_chebyshev(NODES)), -1, 0)
-    halfway, corners = (np.moveaxis(to @ coarse @ to.T, 0, -1) for to in _interpolations(int(camera.S)))
-    is_close = np.abs(halfway - camera.grid(_chebyshev(2 * NODES - 1)[1::2])) < CLOSE  # False for NaN
-    return corners if is_close.all() else camera.grid(np.linspace(-1, 1, int(camera.S) + 1))
-
-
-def _chebyshev(n: int) -> Float[np.ndarray, " n"]:
-    """n Chebyshev points, from -1 to 1."""
-    return -np.cos(np.pi * np.arange(n) / (n - 1))
-
-
-@lru_cache(maxsize=16)
-def _interpolations(n: int) -> tuple[Float[np.ndarray, "places nodes"], ...]:
-    """Matrices from values at Chebyshev points to those halfway between them, and at the ends of n equal parts."""
-    places = (_chebyshev(NODES), _chebyshev(2 * NODES - 1)[1::2], np.linspace(-1, 1, n + 1))
-    nodes, *others = (np.polynomial.chebyshev.chebvander(along, NODES - 1) for along in places)
-    return tuple(other @ np.linalg.inv(nodes) for other in others)
+    """Pixels of the real image at the corners of the pixels of the virtual image; NaN where the lens sees nothing."""
+    return camera.grid(np.linspace(-1, 1, int(camera.S) + 1))
 
 
 def _strip(

@@ -9,8 +9,7 @@ from lightning import LightningDataModule
 from torch import Tensor
 
 from phd_exp.data.backdrops import BACKDROP_NUMBERS, Backdrops, before_others
-from phd_exp.data.batches import Augment, Batch, BatchLoader
-from phd_exp.data.exchanges import Exchange
+from phd_exp.data.batches import Augment, Batch, BatchLoader, Exchange
 from phd_exp.data.photographs import PHOTOGRAPH_NUMBERS, Photographs, replaced
 from phd_exp.data.prints import PRINT_NUMBERS, printed
 from phd_exp.data.sources import PARTS, Part, Source

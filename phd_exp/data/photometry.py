@@ -7,20 +7,17 @@ from typing import ClassVar
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, UInt8
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.nn.functional import pad
+from torch.nn.functional import conv2d, pad
 
 from phd_exp.data.jpeg import compressed
 
 NUMBERS = {"tone": 6, "blur": 1, "noise": 1, "place": 1, "jpeg": 1, "occluder": 1, "shape": 2}
 """The random numbers of an image: what each is for, and how many there are."""
-VERSION = 4  # of the changes; another version trains on other images, so that an interrupted run cannot be resumed
-CACHED = 640 * 1024  # bytes of images whose intermediate values fit in a CPU's cache
-LEVELS = 256
-FIELD = 512  # side of the field of standard normal numbers from which the noise of each image is cut, pixels
-FINE, FARTHEST = 64, 5.0  # these numbers are multiples of 1/FINE up to FARTHEST
+VERSION = 5  # of the changes; another version trains on other images, so that an interrupted run cannot be resumed
+FIELD = 3 * 512**2  # least number of the standard normal numbers from which the noise of each image is cut
 CORNERS = (3, 8)  # least and most of an occluder
 ACROSS = (0.08, 0.25)  # radius of an occluder in widths of the image
 
@@ -68,8 +65,7 @@ class Photometry:
         quality = (100 - (100 - self.jpeg) * loss).round().clip(1)
         is_hidden = drawn["occluder"][:, 0] < 2 * self.occluders - 1
         is_toned = (self.brightness, self.contrast, self.gamma, self.white_balance) != (1, 1, 1, 1)
-        if is_hidden.any() or not is_toned:  # changed in place
-            image = image.clone(memory_format=torch.contiguous_format)
+        image = image.clone(memory_format=torch.contiguous_format)
         change(image, is_hidden, occluded, drawn["shape"])
         if is_toned:
             image = toned(image, self._tones(drawn["tone"]))
@@ -101,23 +97,12 @@ class Photometry:
 def change(image: Images, strength: np.ndarray, formula: Callable[..., Images], *numbers: np.ndarray) -> None:
     """Change the images of a strength above zero in place, given their numbers.
 
-    The strengths are on the host, so that nothing waits for the device. Images of like strength are changed together.
-    They are written in words of 16 bytes if the size allows it, since a CPU copies element by element.
+    The strengths are on the host, so that nothing waits for the device.
     """
-    word = torch.uint8 if image[0].numel() % 16 else torch.complex128
-    words = image.view(len(image), -1).view(word)
     rows = np.flatnonzero(strength)
-    rows = rows[strength[rows].argsort(kind="stable")]
-    for block in blocks(image, len(rows)):
-        chosen = on(image, rows[block])
-        part = formula(image.index_select(0, chosen), *(values[rows[block]] for values in numbers))
-        words.index_copy_(0, chosen, part.flatten(1).view(word))
-
-
-def blocks(image: Tensor, n: int, n_bytes: int = CACHED) -> list[slice]:
-    """Slices of n images that are changed together: a CPU's cache holds few of them, a GPU takes all at once."""
-    step = max(1, n_bytes // image[0].numel() if image.device.type == "cpu" else n)
-    return [slice(start, start + step) for start in range(0, n, step)]
+    if len(rows):
+        place = on(image, rows)
+        image[place] = formula(image.index_select(0, place), *(values[rows] for values in numbers))
 
 
 def on(image: Tensor, numbers: np.ndarray) -> Tensor:
@@ -127,80 +112,45 @@ def on(image: Tensor, numbers: np.ndarray) -> Tensor:
 
 
 def levels(values: Tensor) -> UInt8[Tensor, "..."]:
-    """Values rounded to levels, in place; a CPU converts them faster by way of int16."""
-    return values.round_().clamp_(0, 255).to(torch.int16).to(torch.uint8)
+    """Values rounded to levels, in place."""
+    return values.round_().clamp_(0, 255).to(torch.uint8)
 
 
 def toned(image: Images, tables: UInt8[np.ndarray, "batch bands 256"]) -> Images:
-    """tables[image], two bytes at a time: look-ups take most of the time, of one byte as of two."""
-    n, (batch, bands, _) = image[0].numel(), tables.shape
-    order = np.array([[0, 2, 1], [1, 0, 2]])[:, :bands] % bands  # bands of the first and second bytes of pairs
-    first, second = (on(image, tables[:, of_bytes].astype(np.int16)) for of_bytes in order)
-    whole = image.flatten(1)
-    if n % 6:  # make it a whole number of pairs of each of the three kinds
-        whole = pad(whole, (0, -n % 6))
-    result = torch.empty_like(whole)
-    for block in blocks(image, batch, CACHED // 5):
-        pairs = (second[block, :, :, None].mul(LEVELS) + first[block, :, None]).flatten()
-        places = whole[block].view(torch.uint16).int()
-        starts = on(image, LEVELS**2 * np.arange(len(pairs) // LEVELS**2, dtype=np.int32))
-        if len(starts) > 1:
-            places = places.view(-1, places.shape[1] // bands, bands).add_(starts.view(-1, 1, bands))
-        torch.index_select(pairs, 0, places.flatten(), out=result[block].view(torch.int16).view(-1))
-    return result[:, :n].reshape(image.shape)
+    """tables[image], one for each image, or for each of its channels."""
+    batch, bands, _ = tables.shape
+    first = 256 * (np.arange(batch, dtype=np.int32)[:, None] * bands + np.arange(3, dtype=np.int32) % bands)
+    place = image + on(image, first)[:, None, None]
+    return on(image, tables).flatten().index_select(0, place.flatten()).view_as(image)
 
 
 def blurred(image: Images, deviation: NDArray[np.float64]) -> Images:
-    """The convolution with a Gaussian, up to three times its standard deviation; the border is repeated.
-
-    Weights are multiples of 1/256, so that 16 bits hold all sums of the levels less 128, in half the time of float32.
-    """
+    """The convolution with a Gaussian, up to three times its standard deviation; the border is repeated."""
     reach = np.ceil(3 * deviation)[:, None]
-    place = np.arange(int(reach.max()) + 1)
+    side = int(reach.max())
+    place = np.abs(np.arange(-side, side + 1))
     weight = np.exp(-(place**2) / (2 * deviation[:, None] ** 2)) * (place <= reach)
-    weight = (256 * weight / (2 * weight.sum(1, keepdims=True) - weight[:, :1])).round()
-    weight[:, 0] = 256 - 2 * weight[:, 1:].sum(1)
-    weights = on(image, weight.T.astype(np.int16))[..., None, None, None]
-    height, width = image.shape[1:3]
-    rows = _smooth(image.to(torch.int16).sub_(128), weights)
-    return _smooth(rows.view(-1, 1, height, 3 * width), weights).add_(128).to(torch.uint8).view_as(image)
-
-
-def _smooth(
-    values: Int[Tensor, "batch others places inner"], weights: Int[Tensor, "reach batch 1 1 1"]
-) -> Int[Tensor, "batch others places inner"]:
-    """(weights[0] v[i] + sum over k of weights[k] (v[i - k] + v[i + k])) / 256, rounded."""
-    reach, n = len(weights) - 1, values.shape[2]
-    first, last = values[:, :, :1], values[:, :, -1:]
-    around = torch.cat([*[first] * reach, values, *[last] * reach], dim=2)  # `pad` takes as long as all the sums
-    total, pair = weights[0] * values, torch.empty_like(values)
-    for k in range(1, reach + 1):
-        torch.add(around.narrow(2, reach - k, n), around.narrow(2, reach + k, n), out=pair)
-        total.addcmul_(weights[k], pair)
-    return total.add_(128).bitwise_right_shift_(8)
+    weights = on(image, weight / weight.sum(1, keepdims=True)).repeat_interleave(3, 0)[:, None, :, None]
+    planes = image.permute(0, 3, 1, 2).flatten(0, 1)[None].float()
+    for kernel in (weights, weights.mT):
+        edges = (side, side, 0, 0) if kernel is not weights else (0, 0, side, side)
+        planes = conv2d(pad(planes, edges, mode="replicate"), kernel, groups=len(kernel))
+    return levels(planes).view(-1, 3, *image.shape[1:3]).permute(0, 2, 3, 1).contiguous()
 
 
 def noisy(image: Images, deviation: NDArray[np.float64], place: NDArray[np.float64]) -> Images:
-    """The images with noise of that standard deviation from a place (-1 to 1) of the field.
-
-    It is the product of two integers, divided by the largest power of two for which 16 bits hold all products: this
-    takes two thirds of the time of float32, and differs by at most a level.
-    """
+    """The images with noise of that standard deviation from a place (-1 to 1) of the field."""
     n = image[0].numel()
-    field = _field(max(3 * FIELD**2, 4 * n), image.device)
+    field = _field(max(FIELD, 4 * n), image.device)
     starts = ((len(field) - n) * (place + 1) / 2).astype(np.int64)
-    bits = min(14, int(np.log2(2**15 / (1.1 * FARTHEST * deviation.max() + 1))))
-    factor = on(image, (2**bits / FINE * deviation).round().astype(np.int16))
-    noise = field.unfold(0, n, 1).index_select(0, on(image, starts)).mul_(factor[:, None])
-    noise.add_(1 << (bits - 1)).bitwise_right_shift_(bits).add_(image.flatten(1))
-    return noise.clamp_(0, 255).to(torch.uint8).view_as(image)
+    noise = field.unfold(0, n, 1).index_select(0, on(image, starts)).view(image.shape)
+    return levels(noise.mul_(on(image, deviation)[:, None, None, None]).add_(image))
 
 
 @cache
-def _field(n: int, device: torch.device) -> Int[Tensor, " n"]:
-    """Standard normal numbers in units of 1 / `FINE`."""
-    values = np.random.default_rng(0).standard_normal(n, dtype=np.float32).clip(-FARTHEST, FARTHEST)
-    return torch.from_numpy((FINE * values).round().astype(np.int16)).to(device)
+def _field(n: int, device: torch.device) -> Float[Tensor, " n"]:
+    """Standard normal numbers."""
+    return torch.from_numpy(np.random.default_rng(0).standard_normal(n, dtype=np.float32)).to(device)
 
 
 def occluded(image: Images, shape: NDArray[np.float64]) -> Images:

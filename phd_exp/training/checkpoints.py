@@ -78,9 +78,9 @@ def at_home(content: Any, checkpoints: Path) -> Any:
 class StopBetweenBatches(Checkpoint):
     """Delays a SIGINT or SIGTERM to the end of the batch, saves a checkpoint, and raises the signal again.
 
-    During the last batch and the validation the signal waits for the checkpoint of the epoch: as a Checkpoint callback
-    this one runs in the order of the Trainer's list, and belongs after ModelCheckpoint. A second signal is raised at
-    once. The handlers that were installed before the training receive it.
+    During the last batch and the validation the signal waits for the checkpoint of the epoch: this callback belongs
+    after ModelCheckpoint in the Trainer's list. A second signal is raised at once. The handlers that were installed
+    before the training receive it.
     """
 
     def __init__(self, checkpoint: Path) -> None:
@@ -102,12 +102,16 @@ class StopBetweenBatches(Checkpoint):
         if self.received is not None:
             self._raise(self.received)
 
-    def on_train_end(self, *arguments: Any) -> None:
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self._restore()
+
+    def on_exception(self, *arguments: Any) -> None:
+        self._restore()
+
+    def _restore(self) -> None:
         for signum, handler in self.handlers.items():
             signal.signal(signum, handler)
         self.handlers = {}
-
-    on_exception = on_train_end
 
     def _receive(self, signum: int, frame: FrameType | None) -> None:
         if self.received is not None:
@@ -115,5 +119,5 @@ class StopBetweenBatches(Checkpoint):
         self.received = signum
 
     def _raise(self, signum: int) -> None:
-        self.on_train_end()
+        self._restore()
         signal.raise_signal(signum)

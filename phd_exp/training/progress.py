@@ -11,7 +11,7 @@ from lightning.pytorch.callbacks import TQDMProgressBar
 from phd_exp.records.processes import duration
 
 LINES = 10  # of a training, about
-WARM_UP = 10  # batches before the first line and the first estimate, which the slow first ones would spoil
+WARM_UP = 5  # batches that are slower, and spoil no later estimate; after as many others the first line is printed
 BETWEEN_LOOKS = 0.5  # s between two readings of the loss, which a GPU would have to wait for
 SHOWN = ("test/projected_error_mm", "test/depth_error_mm")
 
@@ -19,7 +19,7 @@ SHOWN = ("test/projected_error_mm", "test/depth_error_mm")
 class Progress(TQDMProgressBar):
     """Shows the epoch, from 1, the time left of the whole training, the loss, and the errors of the last evaluation.
 
-    Where standard output is no terminal, lines follow the warm-up and epochs, about ten in all.
+    Where standard output is no terminal, lines follow the tenth batch and epochs, about ten in all.
     """
 
     def __init__(self) -> None:
@@ -27,10 +27,11 @@ class Progress(TQDMProgressBar):
         if not sys.stdout.isatty():
             self.disable()
 
-    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:  # type: ignore[override]
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         super().on_train_start()
         self.total = int(trainer.estimated_stepping_batches)
-        self.first, self.begun, self.looked = trainer.global_step, time.monotonic(), 0.0
+        self.start = self.first = trainer.global_step
+        self.begun, self.looked = time.monotonic(), 0.0
         self.loss: Any = None
         self.shown: dict[str, Any] = {}
 
@@ -41,11 +42,12 @@ class Progress(TQDMProgressBar):
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        self.loss = outputs["loss"]
-        super().on_train_batch_end(trainer, pl_module, outputs, batch, batch_idx)
-        if trainer.global_step == self.first + WARM_UP:
-            self._line(trainer)
+        self.loss, done = outputs["loss"], trainer.global_step - self.start
+        if done == WARM_UP:
             self.first, self.begun = trainer.global_step, time.monotonic()
+        super().on_train_batch_end(trainer, pl_module, outputs, batch, batch_idx)
+        if done == 2 * WARM_UP:
+            self._line(trainer)
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self.looked = 0.0

@@ -15,7 +15,7 @@ from multiprocessing.queues import SimpleQueue
 from typing import Any
 
 import torch.distributed as dist
-from torch.multiprocessing import start_processes
+from torch.multiprocessing.spawn import start_processes
 
 from phd_exp.records.errors import RunError, UserError
 

@@ -27,6 +27,14 @@ from phd_exp.training.recorder import Draw, Recorder
 from phd_exp.training.tracking import send_results, tracked
 from phd_exp.training.trainer import build_trainer
 
+INTENDED = (
+    ".*LeafSpec.*is deprecated",  # Lightning calls a deprecated name of torch
+    "Precision .* is not supported by the model summary",
+    "Checkpoint directory .* exists and is not empty",  # an interrupted run resumes in the same folder
+    r"Found .* module\(s\) in eval mode",  # BatchNorm that keeps its means and variances
+    "It is recommended to use .*sync_dist=True",  # the logged values are already sums over all processes
+)
+"""Warnings about what a run does on purpose."""
 UNTRAINED = -1  # the number of the epoch before the first, whose metrics are those of the untrained network
 
 
@@ -173,14 +181,5 @@ def quiet_lightning() -> None:
     for name in ("lightning.pytorch", "lightning.fabric"):
         logging.getLogger(name).setLevel(logging.ERROR)
     logging.getLogger("lightning.pytorch.profilers").setLevel(logging.INFO)
-    # Lightning calls a deprecated name of torch
-    warnings.filterwarnings("ignore", ".*LeafSpec.*is deprecated", FutureWarning)
-    warnings.filterwarnings("ignore", "Precision .* is not supported by the model summary")
-    # an interrupted run resumes in the same folder
-    warnings.filterwarnings("ignore", "Checkpoint directory .* exists and is not empty")
-    # the first steps are timed without an evaluation
-    warnings.filterwarnings("ignore", "You defined a `validation_step` but have no `val_dataloader`")
-    # BatchNorm that keeps its means and variances
-    warnings.filterwarnings("ignore", r"Found .* module\(s\) in eval mode")
-    # the logged values are already sums over all processes
-    warnings.filterwarnings("ignore", "It is recommended to use .*sync_dist=True")
+    for intended in INTENDED:
+        warnings.filterwarnings("ignore", intended)

@@ -121,12 +121,11 @@ def require_same_config(folder: RunFolder, config: RunConfig) -> None:
 def require_same_photometry(folder: RunFolder, recipe: RecipeConfig) -> None:
     """Raise RunError for an interrupted run that trained on images changed by another version of `Photometry`."""
     augmentation = build_augmentation(recipe)
-    if augmentation is None or not augmentation.photometry.changes_anything:
+    is_interrupted = folder.last_checkpoint.exists() and not folder.is_finished()
+    if not is_interrupted or augmentation is None or not augmentation.photometry.changes_anything:
         return
-    if folder.is_finished() or not folder.last_checkpoint.exists():
-        return
-    before = folder.constants().get("photometry") if folder.constants_file.exists() else None
-    if before != VERSION:
+    constants = folder.constants() if folder.constants_file.exists() else {}
+    if constants.get("photometry") != VERSION:
         raise RunError(
             f"{folder.path}: interrupted while it trained with light, blur, noise or JPEG of an earlier version, "
             "whose images differ; move the folder away and train again"

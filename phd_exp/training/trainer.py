@@ -19,25 +19,26 @@ from phd_exp.training.checkpoints import AtomicCheckpoints, StopBetweenBatches
 from phd_exp.training.progress import Progress
 from phd_exp.training.recorder import Recorder
 
-OWNED = {
-    "callbacks": "set callbacks=NAME, or +callbacks.NAME._target_=CLASS",
-    "logger": "set logger=NAME, or +logger.NAME._target_=CLASS",
-    "check_val_every_n_epoch": "set evaluation.every_n_epochs",
-    "val_check_interval": "set evaluation.every_n_epochs, since the record has one row an epoch",
-    "enable_progress_bar": "set trainer.progress_bar",
-    "default_root_dir": "set runs",
-    "enable_checkpointing": "set callbacks for further checkpoints; runs resume from their own",
-    "fast_dev_run": "set trainer.max_epochs=1 +trainer.limit_train_batches=1, which leaves a checkpoint",
-    "limit_predict_batches": "set data.n_test, since the record has all test samples",
-    "num_sanity_val_steps": "leave it out: the untrained network is always evaluated",
-    "use_distributed_sampler": "leave it out: batches are divided among the processes already",
-    "reload_dataloaders_every_n_epochs": "leave it out: the data stays in memory",
-    "strategy": "set trainer.devices",
-    "num_nodes": "set trainer.devices, since all processes are on one machine",
-    "plugins": "leave it out: they start the processes and write the checkpoints",
-    "barebones": "leave it out: it would switch the run record off",
-}
-"""Arguments of Lightning's Trainer that the run record depends on, and what to do instead."""
+INSTEAD = {
+    "set callbacks=NAME, or +callbacks.NAME._target_=CLASS; runs resume from their own checkpoints": (
+        "callbacks", "enable_checkpointing",
+    ),
+    "set logger=NAME, or +logger.NAME._target_=CLASS": ("logger",),
+    "set evaluation.every_n_epochs, since the record has one row an epoch": (
+        "check_val_every_n_epoch", "val_check_interval",
+    ),
+    "set trainer.progress_bar": ("enable_progress_bar",),
+    "set runs": ("default_root_dir",),
+    "set trainer.max_epochs=1 +trainer.limit_train_batches=1, which leaves a checkpoint": ("fast_dev_run",),
+    "set data.n_test, since the record has all test samples": ("limit_predict_batches",),
+    "set trainer.devices, since all processes are on one machine": ("strategy", "num_nodes"),
+    "leave it out": (
+        "num_sanity_val_steps", "use_distributed_sampler", "reload_dataloaders_every_n_epochs", "plugins",
+        "barebones",
+    ),
+}  # fmt: skip
+"""What to do instead of setting arguments of Lightning's Trainer that the run record depends on."""
+OWNED = {key: words for words, keys in INSTEAD.items() for key in keys}
 
 
 def build_trainer(config: RunConfig, recorder: Recorder, callbacks: Sequence[Callback] = ()) -> Trainer:

@@ -170,10 +170,9 @@ def test_keys_of_a_part_that_an_experiment_chooses_can_be_set(
     def keep(config: dict[str, Any], overrides: list[str], cores: int) -> None:
         found.append((config["backbone"]["width"], overrides))
 
-    job = Job(keep, cost=lambda configs, cores: 7200.0 * len(configs))
+    job = Job(keep)
     words = ["-m", "experiment=speed", "seed=1", "backbone.width=8", "data.f_range=[1200, 1500]"]
     assert launch(job, words) == 0, capfd.readouterr().err
-    assert "about 2.0 h on " in capfd.readouterr().out, "the time of a sweep is printed"
     ((width, overrides),) = found
     assert width == 8
     assert overrides[-3:] == ["seed=1", "backbone.width=8", "data.f_range=[1200,1500]"]

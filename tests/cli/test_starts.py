@@ -8,11 +8,9 @@ import pytest
 import yaml
 
 from phd_exp.cli.starts import checked_start, with_network_of
-from phd_exp.cli.train import cost
-from phd_exp.config import RunConfig, check
+from phd_exp.config import check
 from phd_exp.records.errors import ConfigError, RunError
 from phd_exp.records.runs import RunFolder
-from phd_exp.training import duration
 from tests.support.synthetic import write_run
 
 
@@ -72,22 +70,6 @@ def test_older_records_have_the_defaults_of_keys_that_they_lack(
     del older["recipe"]["hidden"]
     start.config_file.write_text(yaml.safe_dump(older))
     assert check(with_network_of(start, composed("recipe.hidden=4"), [])).recipe.hidden == 0
-
-
-def test_the_time_of_a_sweep_is_that_of_the_network_it_starts_with(
-    composed: Callable[..., dict[str, Any]], start: RunFolder, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    measured: list[RunConfig] = []
-
-    def a_second(config: RunConfig, threads: int) -> float:
-        measured.append(config)
-        return 1.0
-
-    monkeypatch.setattr(duration, "seconds_a_step", a_second)
-    words = ("preset=full", "trainer=cpu")
-    assert cost([composed(*words, f"init={start.path}")] * 14, 1) > 0
-    assert measured[0].backbone == start.config()["backbone"] != composed(*words)["backbone"]
-    assert cost([composed(*words, "init=nowhere")] * 14, 1) == 0
 
 
 def test_what_cannot_be_a_start_is_refused(composed: Callable[..., dict[str, Any]], start: RunFolder) -> None:

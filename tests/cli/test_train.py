@@ -6,11 +6,10 @@ from pathlib import Path
 import pytest
 
 import phd_exp as package
-from phd_exp.cli.train import announce, cost, run_name
+from phd_exp.cli.train import announce, run_name
 from phd_exp.config import RunConfig, check
 from phd_exp.records.errors import ConfigError
 from phd_exp.records.runs import RunFolder
-from phd_exp.training import duration
 
 
 @pytest.fixture(scope="module")
@@ -83,24 +82,6 @@ def test_a_run_first_prints_its_cost(
     assert len(rest) == lines - 1
     if rest:
         assert rest[-1].endswith("python -m phd_exp model=mae_logz data=scale preset=small")
-
-
-def test_the_time_of_long_sweeps_is_that_of_their_steps(composed, monkeypatch: pytest.MonkeyPatch) -> None:  # type: ignore[no-untyped-def]
-    short, long = (composed(*words, "trainer=cpu", "recipe=strong") for words in (["preset=smoke"], ["preset=full"]))
-    assert cost([short], 1) == 0
-    monkeypatch.setattr(duration, "seconds_a_step", lambda config, threads: 3.0 / threads)
-    data, epochs = long["data"], long["trainer"]["max_epochs"]
-    once = 3 * data["n_train"] / data["batch_size"] * epochs
-    seen = [config["data"]["n_train"] * config["trainer"]["max_epochs"] for config in (long, short)]
-    assert cost([long] * 14, 1) == pytest.approx(14 * once)
-    assert cost([long] * 14, 2) == pytest.approx(7 * once)
-    assert cost([*[long] * 3, short], 1) == pytest.approx(once * (3 + seen[1] / seen[0]))
-    assert cost([{**long, "seed": -1}] * 14, 1) == 0
-
-
-def test_a_step_is_measured_on_random_images(config: RunConfig, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(duration, "ENOUGH", 0.02)
-    assert 0 < duration.seconds_a_step(config, 1) < 10
 
 
 def test_one_word_instead_of_a_list_is_refused() -> None:

@@ -8,8 +8,7 @@ from torch.testing import assert_close
 
 from phd_exp.data.augmentation import Augmentation, moved
 from phd_exp.data.backdrops import BACKDROP_NUMBERS, Backdrops, before_others
-from phd_exp.data.batches import Batch
-from phd_exp.data.exchanges import Exchange
+from phd_exp.data.batches import Batch, Exchange
 from phd_exp.data.photometry import Photometry
 from phd_exp.geometry import Camera
 from phd_exp.geometry.motion import Motion, symmetries

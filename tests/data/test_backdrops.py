@@ -11,9 +11,8 @@ import pytest
 import torch
 
 from phd_exp.data.backdrops import BACKDROP_NUMBERS, FINEST, Backdrops, before_others, tiled
-from phd_exp.data.batches import Augment, Batch
+from phd_exp.data.batches import Augment, Batch, Exchange
 from phd_exp.data.datamodule import PositionData
-from phd_exp.data.exchanges import Exchange
 from phd_exp.data.sources import RenderedSource
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.errors import ConfigError

@@ -8,9 +8,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from phd_exp.data.batches import Batch
+from phd_exp.data.batches import Batch, Exchange
 from phd_exp.data.datamodule import PositionData
-from phd_exp.data.exchanges import Exchange
 from phd_exp.data.photographs import PHOTOGRAPH_NUMBERS, Photographs, replaced
 from phd_exp.data.sources import RenderedSource
 from phd_exp.records.dataset import DatasetFolder

@@ -7,9 +7,8 @@ import pytest
 import torch
 
 from phd_exp.data.backdrops import BACKDROP_NUMBERS, Backdrops, before_others
-from phd_exp.data.batches import Batch
+from phd_exp.data.batches import Batch, Exchange
 from phd_exp.data.datamodule import PositionData
-from phd_exp.data.exchanges import Exchange
 from phd_exp.data.prints import GREY, PRINT_NUMBERS, printed
 from phd_exp.data.sources import Part, Source
 from phd_exp.geometry.charts import DepthScale

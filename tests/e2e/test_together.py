@@ -31,7 +31,7 @@ TOGETHER = ("trainer=ddp", "trainer.accelerator=cpu")
 
 
 def descendants(process: int) -> list[int]:
-    """The processes that a process started and that run phd_exp.training.ranks, in the order of their ranks."""
+    """The processes of a training that a process started, in the order of their ranks."""
     found = []
     for stat in Path("/proc").glob("[0-9]*/stat"):
         try:
@@ -39,7 +39,7 @@ def descendants(process: int) -> list[int]:
             words = (stat.parent / "cmdline").read_text().split("\0")
         except (OSError, IndexError):
             continue
-        if parent == process and "phd_exp.training.ranks" in words:
+        if parent == process and "--multiprocessing-fork" in words:
             found.append(int(stat.parent.name))
     return sorted(found)
 

@@ -94,8 +94,8 @@ def test_the_view_contains_the_border_of_the_box_and_faces_its_middle(lens: Lens
 
 @pytest.mark.parametrize("box", [(60.0, 30.0, 300.0, 220.0), (0.0, 0.0, 640.0, 480.0)], ids=["box", "whole"])
 @pytest.mark.parametrize("lens", [*LENSES.values(), Lens((-0.3,)), PINHOLE], ids=[*LENSES, "folds", "pinhole"])
-def test_interpolated_corners_of_pixels_are_exact(lens: Lens, box: Box) -> None:
-    """Also where a fisheye's view is too wide to be interpolated, or a lens folds over, which leaves NaN."""
+def test_corners_of_pixels_are_exact(lens: Lens, box: Box) -> None:
+    """Also where a lens folds over, which leaves NaN."""
     box = (320.0, 0.0, 840.0, 480.0) if lens.coefficients == (-0.3,) else box
     camera = VirtualCamera.of_box(K, box, 96.0, lens)
     along = (np.arange(97) - 48) / camera.f

@@ -16,8 +16,7 @@ from phd_exp import build, hardware
 from phd_exp.config import RunConfig, check
 from phd_exp.config.sections import EvaluationConfig
 from phd_exp.data.backdrops import BACKDROP_NUMBERS, Backdrops, before_others
-from phd_exp.data.batches import Batch, BatchLoader
-from phd_exp.data.exchanges import Exchange
+from phd_exp.data.batches import Batch, BatchLoader, Exchange
 from phd_exp.data.images import SHRINKING
 from phd_exp.data.photometry import VERSION
 from phd_exp.data.prints import PRINT_NUMBERS, printed

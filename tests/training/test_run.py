@@ -5,7 +5,6 @@ import math
 import os
 import shutil
 import signal
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,17 +12,13 @@ from typing import Any
 import pandas as pd
 import pytest
 import torch
-from lightning.pytorch.callbacks import ProgressBar
 
 from phd_exp.config import check
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.errors import RunError
 from phd_exp.records.runs import RunFolder
-from phd_exp.training import trainer as build
 from phd_exp.training.checkpoints import AtomicCheckpoints
 from phd_exp.training.module import PositionModule
-from phd_exp.training.progress import Progress
-from phd_exp.training.recorder import Recorder
 from phd_exp.training.train import require_same_config, train
 from tests.support.recorded import once, status_of, weights
 
@@ -244,21 +239,6 @@ def test_a_loss_that_is_not_finite_names_its_samples(
         run_in(tmp_path, *LONG)
     assert "lower optimizer.lr" in str(caught.value)
     assert all(weight.isfinite().all() for weight in weights(RunFolder(tmp_path)).values())
-
-
-@pytest.mark.parametrize(
-    ("terminal", "words", "bars"),
-    [(True, (), [True]), (False, (), [False]), (True, ("trainer.progress_bar=false",), [])],
-)
-def test_progress_is_a_bar_on_a_terminal_and_lines_elsewhere(
-    composed: Callable, monkeypatch: pytest.MonkeyPatch, tmp_path: Path,
-    terminal: bool, words: tuple[str, ...], bars: list[bool],
-) -> None:  # fmt: skip
-    monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal)
-    config = check(composed("preset=smoke", "trainer=cpu", *words))
-    trainer = build.build_trainer(config, Recorder(RunFolder(tmp_path), config.evaluation, None, []))
-    found = [callback for callback in trainer.callbacks if isinstance(callback, ProgressBar | Progress)]  # type: ignore[attr-defined]
-    assert [callback.bar is not None for callback in found] == bars
 
 
 @pytest.mark.parametrize(
