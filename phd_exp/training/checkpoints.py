@@ -63,7 +63,8 @@ def at_home(content: Any, checkpoints: Path) -> Any:
     """
     if isinstance(content, str):
         leads_away = content.startswith(("/", "~")) or "://" in content or ".." in Path(content).parts
-        if leads_away or os.path.isfile(content):  # a single word that names a folder here may be anything else
+        # a single word that names a folder here, such as `test`, may be anything else
+        if leads_away or os.path.isfile(content) or ("/" in content and os.path.lexists(content)):
             name = Path(content).name
             return str(checkpoints if name in ("..", checkpoints.name) else checkpoints / name)
     if isinstance(content, dict):  # in place, which keeps its class
