@@ -11,7 +11,7 @@ import pyarrow.parquet as pq
 import torch
 from torch import Tensor
 
-from phd_exp.records.errors import RunError, gist, remedy
+from phd_exp.records.errors import RunError, reading
 from phd_exp.records.files import MB, require_plain
 
 Arrays = Mapping[str, np.ndarray]
@@ -37,7 +37,9 @@ def read_table(file: Path) -> Arrays:
         ...     read_table(Path(file.name))["z"].tolist()
         [3.5, 4.5]
     """
-    try:
+    if not file.exists():
+        raise RunError(f"{file}: missing, though the run has finished")
+    with reading(file, kind=RunError):
         require_plain(file, LARGEST)
         # pyarrow opens no name that is not UTF-8, and its threads may hold buffers of a Python file while the program
         # exits, which would abort it
@@ -48,10 +50,6 @@ def read_table(file: Path) -> Arrays:
             texts = [name for name in TEXTS if name in metadata.schema.to_arrow_schema().names]
             table = pq.ParquetFile(stream, metadata=metadata, read_dictionary=texts).read()
             return {name: _values(name, table[name]) for name in table.column_names}
-    except FileNotFoundError:
-        raise RunError(f"{file}: missing, though the run has finished") from None
-    except (pa.ArrowException, OSError, KeyError, TypeError, ValueError) as error:
-        raise RunError(f"{file}: cannot be read ({gist(error)}){remedy(error)}") from None
 
 
 def require_columns(names: Iterable[str], table: Collection[str], what: str = "predictions") -> None:

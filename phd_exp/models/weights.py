@@ -8,7 +8,7 @@ from zipfile import ZIP_STORED, ZipFile
 import torch
 from torch import nn
 
-from phd_exp.records.errors import RunError, remedy
+from phd_exp.records.errors import RunError, reading
 from phd_exp.records.files import require_plain
 
 ADVICE = "delete it to begin the run again"
@@ -20,20 +20,18 @@ def load_checkpoint(file: Path, map_location: Any = None) -> dict[str, Any]:
 
     Raises RunError, one line, for any other file.
     """
-    try:
+    with reading(file, ADVICE, RunError, "not a whole checkpoint"):
         require_plain(file)
         with ZipFile(file) as archive:  # a compressed file may unpack to any size
             if any(entry.compress_type != ZIP_STORED for entry in archive.infolist()):
                 raise ValueError("its content is compressed, which torch never does")
-        content = torch.load(file, map_location or "cpu", weights_only=True)
-    except UnpicklingError:
-        raise RunError(f"{file}: holds more than tensors and plain values, which is not read; {ADVICE}") from None
-    except Exception as error:  # torch raises any error on other bytes
-        reason = " ".join((getattr(error, "strerror", None) or str(error).split("\n")[0]).split())[:120]
-        raise RunError(f"{file}: not a whole checkpoint ({reason}){remedy(error, ADVICE)}") from None
-    if not isinstance(content, dict):
-        raise RunError(f"{file}: not a checkpoint of a run; {ADVICE}")
-    return content
+        try:
+            content = torch.load(file, map_location or "cpu", weights_only=True)
+        except UnpicklingError:
+            raise ValueError("holds more than tensors and plain values, which is not read") from None
+        if not isinstance(content, dict):
+            raise ValueError("not of a run")
+        return content
 
 
 def regressor_weights(checkpoint: Path) -> dict[str, Any]:

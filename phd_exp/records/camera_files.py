@@ -16,8 +16,8 @@ from phd_exp.records.parsing import parse_json, parse_yaml
 COLMAP = {
     "SIMPLE_PINHOLE": "f cx cy",
     "PINHOLE": "fl_x fl_y cx cy",
-    **{"SIMPLE_RADIAL": "f cx cy k1", "SIMPLE_RADIAL_FISHEYE": "f cx cy k1"},
-    **{"RADIAL": "f cx cy k1 k2", "RADIAL_FISHEYE": "f cx cy k1 k2"},
+    **dict.fromkeys(("SIMPLE_RADIAL", "SIMPLE_RADIAL_FISHEYE"), "f cx cy k1"),
+    **dict.fromkeys(("RADIAL", "RADIAL_FISHEYE"), "f cx cy k1 k2"),
     "OPENCV": "fl_x fl_y cx cy k1 k2 p1 p2",
     "FULL_OPENCV": "fl_x fl_y cx cy k1 k2 p1 p2 k3 k4 k5 k6",
     "OPENCV_FISHEYE": "fl_x fl_y cx cy k1 k2 k3 k4",
@@ -27,15 +27,9 @@ READ = (
     "ROS (camera_info, ost.ini), OpenCV's FileStorage, Kalibr, COLMAP (cameras.txt), nerfstudio (transforms.json), "
     "Anipose (TOML), the numbers of K or fx fy cx cy, or JSON or YAML with K, D, distortion_model, width and height"
 )
-NOT_READ = {
-    "cameraData": "DepthAI's calibration: write intrinsicMatrix, distortionCoeff, width and height of one camera as "
-    "K, D, width and height",
-    "FocalLength": "MATLAB's cameraIntrinsics: write K with both coordinates of PrincipalPoint less by one, since "
-    "MATLAB counts from one, and D as k1, k2, p1, p2, k3",
-}
-"""A key of a file -> what the file is, and how to write it in a form that is read."""
 _SECTION = re.compile(r"\[([A-Za-z][^\]\"'{}:,]*)\]")
-_ROW = re.compile(r"\d+\s+[A-Z_]+\s+\d+\s+\d+(\s+[-+.\deE]+)+")
+_NUMBERS = r"(?:[-+]?[\d.]+(?:[eE][-+]?\d+)?[\s,]*)+"
+_OF_INI = re.compile(rf"^([A-Za-z].*)\n({_NUMBERS})", re.MULTILINE)
 _OF_OPENCV = re.compile(r"^%YAML.*$|!!opencv-(nd-)?matrix", re.MULTILINE)
 _NO_SPACE = re.compile(r"^(\s*[\w.]+):(?=[\w\[-])", re.MULTILINE)  # which OpenCV does not need
 _ELSEWHERE = ("rotation", "quaternion", "orientation")
@@ -54,11 +48,12 @@ def _content_of(text: str) -> Any:
     """The content of a file, whose format is that of its first lines."""
     lines = [line.strip() for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
     if lines and _SECTION.fullmatch(lines[0]):
-        return tomllib.loads(text) if any("=" in line for line in lines) else _ini(lines)
-    rows = [line.replace(",", " ").split() for line in lines]
-    if rows and all(_is_number(word) for row in rows for word in row):
-        return _of_numbers(rows)
-    if lines and all(map(_ROW.fullmatch, lines)):
+        if any("=" in line for line in lines):
+            return tomllib.loads(text)
+        return [{name: numbers.split()} for name, numbers in _OF_INI.findall("\n".join(lines))]
+    if lines and all(re.fullmatch(_NUMBERS, line) for line in lines):
+        return _of_numbers([line.replace(",", " ").split() for line in lines])
+    if lines and all(re.fullmatch(rf"\d+\s+[A-Z_]+\s+\d+\s+\d+\s+{_NUMBERS}", line) for line in lines):
         return [_of_colmap(line.split()) for line in lines]
     if text.lstrip().startswith("<"):
         return _of_xml(text)
@@ -81,20 +76,6 @@ def entries(node: Any, key: str = "") -> Iterator[tuple[str, Any]]:
             yield from entries(item, key)
     elif key:
         yield key, node
-
-
-def _ini(lines: list[str]) -> dict[str, Any]:
-    """Sections of names, with the numbers of each on the lines below it."""
-    sections: dict[str, dict[str, list[str]]] = {}
-    words: list[str] = []
-    for line in lines:
-        if found := _SECTION.fullmatch(line):
-            section = sections.setdefault(found[1], {})
-        elif all(map(_is_number, line.split())):
-            words.extend(line.split())
-        else:
-            words = section.setdefault(line, [])
-    return {name: {key: _one(given) for key, given in section.items()} for name, section in sections.items()}
 
 
 def _of_numbers(rows: list[list[str]]) -> dict[str, Any]:
@@ -131,13 +112,4 @@ def _of_xml(text: str) -> Any:
 def _of_element(element: ElementTree.Element) -> Any:
     if len(element):
         return {child.tag: _of_element(child) for child in element}
-    words = (element.text or "").split()
-    return words if element.tag == "data" else _one(words)
-
-
-def _is_number(word: str) -> bool:
-    return re.fullmatch(r"[-+]?[\d.]+([eE][-+]?\d+)?", word) is not None
-
-
-def _one(words: list[str]) -> Any:
-    return words[0] if len(words) == 1 else words
+    return (element.text or "").split() if element.tag == "data" else (element.text or "").strip()

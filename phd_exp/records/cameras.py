@@ -15,12 +15,12 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import BaseModel, BeforeValidator, Field, model_validator
 
 from phd_exp.optics.lens import Lens
 from phd_exp.optics.virtual import require_no_fold
-from phd_exp.records.camera_files import NOT_READ, READ, content_of, entries
-from phd_exp.records.errors import DatasetError, gist, listed, shown
+from phd_exp.records.camera_files import READ, content_of, entries
+from phd_exp.records.errors import DatasetError, gist, listed, reading, shown
 from phd_exp.records.files import LARGEST_RECORD, MB, read_plain
 from phd_exp.records.parsing import Record, parse_json
 
@@ -28,6 +28,8 @@ CORNER = 0.5  # px from the corner of the first pixel to its centre
 LARGEST = 1e6  # of any number in a camera file
 WIDEST = 150  # degrees that an image may show, unless through a fisheye
 SHORTEST = 0.01  # focal length, px; a shorter one is probably in metres
+RULE = "see `Lenses` in docs/guides/own_images.md"
+ONE_CAMERA = "expected the calibration of one camera alone"
 Model = Literal["plumb_bob", "rational_polynomial", "equidistant"]
 COEFFICIENTS = {
     "plumb_bob": ("k1", "k2", "p1", "p2", "k3"),
@@ -39,7 +41,7 @@ NAMES = {
     "height": "imageheight height h",
     "size": "resolution imagesize cameraresolution size",
     "K": "k cameramatrix camk mtx intrinsics matrix",
-    **{"fx": "fx flx", "fy": "fy fly", "cx": "cx", "cy": "cy"},
+    **{"flx": "flx", "fly": "fly", "fx": "fx", "fy": "fy", "cx": "cx", "cy": "cy"},
     "D": "d dist distcoeff distcoeffs distortion distortions distortioncoeffs distortioncoefficients",
     "model": "distortionmodel cameramodel",
     "fisheye": "fisheyemodel isfisheye fisheye",
@@ -60,9 +62,23 @@ _MODELS = {"": "none"} | {alias: model for model, aliases in MODELS.items() for 
 _COEFFICIENT, _LENS = re.compile(r"[dkps]\d|xi|skew"), re.compile(r"distor|radial|tangential|coef(?!.*stddev)")
 """Names that belong to a lens even where they are none of `NAMES`."""
 
+
+def _flat(value: Any) -> list[Any]:
+    """The items of a list, of nested lists, of a matrix with data, or of one of these in quotation marks."""
+    value = value["data"] if isinstance(value, dict) else value
+    value = parse_json(value) if isinstance(value, str) and value.startswith("[") else value
+    return [number for item in value for number in _flat(item)] if isinstance(value, list) else [value]
+
+
+def _only(value: Any) -> Any:
+    """The only item of a list, as ROS's INI has it; other values are returned unchanged."""
+    return value[0] if isinstance(value, list) and len(value) == 1 else value
+
+
+Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST, allow_inf_nan=False)]
 Size = Annotated[int, Field(gt=0)]
-Found = dict[str, tuple[str, Any]]
-"""Quantity -> its key in the file, and its value."""
+Side = Annotated[Size | None, BeforeValidator(_only)]
+Numbers = Annotated[list[Number], BeforeValidator(_flat)]
 
 
 class Calibration(Record):
@@ -102,14 +118,89 @@ class Calibration(Record):
         return self
 
 
+class _Region(BaseModel):
+    """ROS's region of interest in pixels of the sensor; zeros for all of it."""
+
+    x_offset: int = 0
+    y_offset: int = 0
+    width: int = 0
+    height: int = 0
+
+
+class _Described(BaseModel):
+    """A camera as its file describes it, by the quantities of `NAMES`; `named` are coefficients with names."""
+
+    width: Side = None
+    height: Side = None
+    size: Annotated[tuple[Size, Size], BeforeValidator(_flat)] | None = None
+    K: Numbers = []
+    flx: Number | None = None
+    fly: Number | None = None
+    fx: Number | None = None
+    fy: Number | None = None
+    cx: Number | None = None
+    cy: Number | None = None
+    D: Numbers | None = None
+    named: dict[str, Number] = {}
+    model: str | None = None
+    fisheye: bool | None = None
+    binning_x: int = 1
+    binning_y: int = 1
+    roi: _Region = _Region()
+
+    @property
+    def matrix(self) -> list[float]:
+        """K by rows. COLMAP and nerfstudio, which name the focal length fl_x, count pixels from the corner."""
+        corner = 0.0 if self.flx is None else CORNER
+        single = [self.fx, self.fy] if self.flx is None else [self.flx, self.fly]
+        fx, fy, cx, cy = self.K if len(self.K) == 4 else [*single, self.cx, self.cy]
+        if fx is None:
+            return self.K
+        if fy is None or cx is None or cy is None:
+            raise ValueError("fx, fy, cx, cy: one is missing; expected all of them")
+        rows = [fx, 0.0, cx - corner, 0.0, fy, cy - corner, 0.0, 0.0, 1.0]
+        if len(self.K) == 9 and rows != self.K:
+            raise ValueError(f"K: differs from fx, fy, cx, cy; {ONE_CAMERA}")
+        return rows
+
+    @property
+    def lens(self) -> tuple[Any, list[float]]:
+        """The model, and its coefficients, with zeros for those that the file leaves out."""
+        D, named, model = self.D or [], self.named, self.model or ("equidistant" if self.fisheye else None)
+        if any(D) and any(named.values()):
+            raise ValueError(f"D and {', '.join(named)}: are two lenses; expected one")
+        if model in COEFFICIENTS and self.D is None and not named:
+            raise ValueError(f"D: missing; expected the coefficients of {model}")
+        if not any([*D, *named.values()]):
+            model = model if model in COEFFICIENTS else "plumb_bob"
+            return model, [0.0] * len(COEFFICIENTS[model])
+        names = COEFFICIENTS.get(model := model or self._only_model(), ())
+        given = named or dict(zip([*names, *map(str, range(len(D)))], D, strict=False))
+        # fewer than four are of another model
+        if 0 < len(D) < 4 or any(value for name, value in given.items() if name not in names):
+            expected = f"{', '.join(names) or 'none'} for {model}, zero beyond"
+            raise ValueError(f"coefficients: got {D or named}; expected {expected}")
+        return model, [given.get(name, 0.0) for name in names]
+
+    def _only_model(self) -> str:
+        """The only model with coefficients of these names, or so many. Raises ValueError if there are two."""
+        n, is_pinhole = len(self.D or ()), self.fisheye is False or bool(self.named.keys() & {"p1", "p2"})
+        if n in (8, 12, 14) or (is_pinhole and "k6" in self.named):
+            return "rational_polynomial"
+        if n == 5 or (is_pinhole and n <= 4):
+            return "plumb_bob"
+        raise ValueError(
+            f"{n or len(self.named)} coefficients of no model; add distortion_model: plumb_bob (k1, k2, p1, p2) or "
+            "equidistant (k1, k2, k3, k4)"
+        )
+
+
 def read_camera(path: Path) -> Calibration:
     """The calibration in a camera file. Raises DatasetError, one line that names the file, if there is none."""
-    try:
+    with reading(path, RULE):
         # YAML takes seconds a megabyte
         text = read_plain(path, LARGEST_RECORD if path.suffix == ".json" else MB).decode("utf-8-sig")
         return calibration_in(content_of(text))
-    except (OSError, ValueError, LookupError, RecursionError) as error:
-        raise DatasetError(f"{path}: {gist(error)}; see `Lenses` in docs/guides/own_images.md") from None
 
 
 def calibration_in(content: Any, image: tuple[int, int] | None = None) -> Calibration:
@@ -117,13 +208,46 @@ def calibration_in(content: Any, image: tuple[int, int] | None = None) -> Calibr
 
     `image` is the size of the images, where it is known.
     """
-    found = _found(content)
-    (width, height), (model, D) = _size(found), _lens(found)
-    sensor = Calibration(width=width, height=height, K=tuple(_matrix(found)), D=tuple(D), model=model)
-    return _read_out(sensor, found, image)
+    described = _described(content)
+    (width, height), (model, D) = described.size or (described.width, described.height), described.lens
+    sensor = Calibration(width=width, height=height, K=tuple(described.matrix), D=tuple(D), model=model)
+    return _read_out(sensor, described, image)
 
 
-def _read_out(sensor: Calibration, found: Found, image: tuple[int, int] | None) -> Calibration:
+def _described(content: Any) -> _Described:
+    """The quantities of a file. Raises ValueError if one has two values, or there is no focal length."""
+    values = list(entries(content))
+    found: dict[str, Any] = {}
+    for key, value in values:
+        name = _quantity(key, value)
+        if name == "model":
+            given, value = value, _MODELS.get(_plain(value))
+            if value is None:
+                raise ValueError(f"{key}: got {shown(given)}; expected {', '.join(COEFFICIENTS)}, or another name")
+        if name and value != "" and found.setdefault(name, value) != value:
+            raise ValueError(f"{key}: has two values; {ONE_CAMERA}")
+    if not {"K", "fx", "flx"} & found.keys():
+        raise ValueError(f"no camera matrix: found {listed([*dict(values)]) or 'no keys'}; expected {READ}")
+    named = {name: found[name] for name in COEFFICIENTS["rational_polynomial"] if name in found}
+    return _Described(**{name: found[name] for name in found.keys() & _Described.model_fields}, named=named)
+
+
+def _quantity(key: str, value: Any) -> str | None:
+    """The quantity with a key, if it is one. Raises ValueError for a part of a lens that is none."""
+    outer, _, name = key.rpartition(".")
+    quantity = _QUANTITIES.get(_plain(name))
+    is_list = isinstance(value, list | dict)
+    of_a_lens = _COEFFICIENT.fullmatch(_plain(name)) or _LENS.search(_plain(key if is_list else outer))
+    if quantity is None and of_a_lens and not isinstance(value, str) and re.search("[1-9]", str(value)):
+        raise ValueError(f"{key}: got {shown(value)}, a part of a lens that is not supported; expected zero")
+    return quantity
+
+
+def _plain(name: Any) -> str:
+    return re.sub(r"[^a-z\d]", "", str(name).lower())
+
+
+def _read_out(sensor: Calibration, described: _Described, image: tuple[int, int] | None) -> Calibration:
     """The camera of the pixels that ROS's region of interest and binning leave of a sensor.
 
     The region is in pixels of the sensor; a binned pixel covers a rectangle of them. Raises ValueError if the images
@@ -132,23 +256,20 @@ def _read_out(sensor: Calibration, found: Found, image: tuple[int, int] | None) 
 
     Source: the definition of sensor_msgs/CameraInfo.
     """
-    region = found.get("roi", ("roi", {}))[1]
-    x, y, *cut = (int(_numbers("roi", region.get(key, 0))[0]) for key in ("x_offset", "y_offset", "width", "height"))
-    bins = [max(1, int(_numbers(*found.get(f"binning_{axis}", ("", 1)))[0])) for axis in "xy"]
-    if not any((x, y, *cut)) and bins == [1, 1]:
+    region, bins = described.roi, [max(1, described.binning_x), max(1, described.binning_y)]
+    if region == _Region() and bins == [1, 1]:
         return sensor
     full, whole = sensor.intrinsics, (sensor.width or 0, sensor.height or 0)
-    expected = (cut[0] or whole[0]) // bins[0], (cut[1] or whole[1]) // bins[1]
-    width, height = image or expected
-    K = np.diag([*np.divide(1, bins), 1]) @ (full - [[0, 0, x], [0, 0, y], [0, 0, 0]])
+    expected = (region.width or whole[0]) // bins[0], (region.height or whole[1]) // bins[1]
+    K = np.diag([*np.divide(1, bins), 1]) @ (full - [[0, 0, region.x_offset], [0, 0, region.y_offset], [0, 0, 0]])
     if image and image != expected:
         nearer, farther = (np.linalg.norm(one[:2, 2] - np.divide(image, 2)) for one in (K, full))
         if image != whole or nearer > farther:
             raise ValueError(
-                f"binning {bins[0]} x {bins[1]} and the region of {cut[0]} x {cut[1]} pixels at ({x}, {y}) of "
-                f"{whole[0]} x {whole[1]} make no images of {width} x {height}; expected width, height and K of the "
-                "whole sensor"
+                f"binning {bins} and region {[*region.model_dump().values()]} of {whole} make no images of {image}; "
+                "expected width, height and K of the whole sensor"
             )
+    width, height = image or expected
     K[:2, 2] -= CORNER
     return sensor.model_copy(
         update={"width": width or None, "height": height or None, "K": tuple(K.ravel().tolist())}
@@ -187,123 +308,3 @@ def require_narrow(fx: float, fy: float, width: int, height: int) -> None:
             f"degrees; expected at most {WIDEST}; f in millimetres must be divided by the size of a pixel in "
             "millimetres"
         )
-
-
-def _found(content: Any) -> Found:
-    """The quantities of a file. Raises ValueError if one has two values, or there is no focal length."""
-    values = list(entries(content))
-    keys = list(dict(values))
-    if known := [text for name, text in NOT_READ.items() if any(name in key for key in keys)]:
-        raise ValueError(known[0])
-    names = [_quantity(key, value) for key, value in values]
-    if not {"K", "fx"} & set(names):
-        raise ValueError(f"no camera matrix: found {listed(keys) or 'no keys'}; expected {READ}")
-    found: Found = {}
-    for name, (key, given) in zip(names, values, strict=True):
-        value = _model(key, given) if name == "model" else given
-        if name and value != "" and found.setdefault(name, (key, value))[1] != value:
-            raise ValueError(f"{found[name][0]} and {key} differ; expected the calibration of one camera alone")
-    return found
-
-
-def _quantity(key: str, value: Any) -> str | None:
-    """The quantity with a key, if it is one. Raises ValueError for a part of a lens that is none."""
-    *outer, name = map(_plain, key.split("."))
-    is_list = isinstance(value, list | dict)
-    quantity = _QUANTITIES.get(name)
-    if (quantity in ("K", "D") and isinstance(value, int | float)) or (
-        quantity == "roi" and not isinstance(value, dict)
-    ):
-        return None
-    of_a_lens = _COEFFICIENT.fullmatch(name) or any(map(_LENS.search, [*outer, name] if is_list else outer))
-    if quantity is None and of_a_lens and not isinstance(value, str) and re.search("[1-9]", str(value)):
-        raise ValueError(f"{key}: got {shown(value)}, a part of a lens that is not supported; expected zero")
-    return quantity
-
-
-def _plain(name: Any) -> str:
-    return re.sub(r"[^a-z\d]", "", str(name).lower())
-
-
-def _model(key: str, value: Any) -> str:
-    model = _MODELS.get(_plain(value))
-    if model is None:
-        raise ValueError(f"{key}: got {shown(value)}; expected {', '.join(COEFFICIENTS)}, or another name of these")
-    return model
-
-
-def _numbers(key: str, value: Any) -> list[float]:
-    """The numbers of a list, of nested lists, or of a matrix with rows, cols and data; or one number."""
-    if isinstance(value, dict):
-        numbers, sizes = _numbers(key, value["data"]), value.get("sizes", [value.get("rows"), value.get("cols")])
-        if None not in sizes and math.prod(map(int, sizes)) != len(numbers):
-            raise ValueError(f"{key}: got {len(numbers)} numbers in data; expected rows x cols = {sizes}")
-        return numbers
-    if isinstance(value, str) and value.startswith("["):  # a matrix in quotation marks
-        value = parse_json(value)
-    if isinstance(value, list):
-        return [number for item in value for number in _numbers(key, item)]
-    try:
-        number = float(value)  # of a text too: 1e-05 is one to PyYAML
-        if abs(number) <= LARGEST:
-            return [number]
-    except (TypeError, ValueError):
-        pass
-    raise ValueError(f"{key}: got {shown(value)}; expected numbers up to {LARGEST:.0f}")
-
-
-def _size(found: Found) -> list[Any]:
-    """Width and height; None if the file has none."""
-    if "size" not in found:
-        return [found.get(name, ("", None))[1] for name in ("width", "height")]
-    size = _numbers(*found["size"])
-    if len(size) != 2:
-        raise ValueError(f"{found['size'][0]}: got {size}; expected width and height")
-    return size
-
-
-def _matrix(found: Found) -> list[float]:
-    """K by rows. COLMAP and nerfstudio, which name the focal length fl_x, count pixels from the corner."""
-    K, names = _numbers(*found["K"]) if "K" in found else [], ("fx", "fy", "cx", "cy")
-    if "fx" not in found and len(K) != 4:
-        return K
-    if missing := [name for name in names if len(K) != 4 and name not in found]:
-        raise ValueError(f"{missing[0]} is missing: found {listed([key for key, _ in found.values()])}")
-    fx, fy, cx, cy = K if len(K) == 4 else (_numbers(*found[name])[0] for name in names)
-    centre = CORNER if "fl" in found.get("fx", ("",))[0].lower() else 0.0
-    rows = [fx, 0.0, cx - centre, 0.0, fy, cy - centre, 0.0, 0.0, 1.0]
-    if len(K) == 9 and rows != K:
-        raise ValueError(f"{found['K'][0]} and {found['fx'][0]} differ; expected the calibration of one camera alone")
-    return rows
-
-
-def _lens(found: Found) -> tuple[Any, list[float]]:
-    """The model, and its coefficients, with zeros for those that the file leaves out."""
-    D = _numbers(*found["D"]) if "D" in found else []
-    named = {name: _numbers(*found[name])[0] for name in COEFFICIENTS["rational_polynomial"] if name in found}
-    if D and any(named.values()):
-        raise ValueError(f"{found['D'][0]} and {', '.join(named)} are two lenses; expected one")
-    flag = str(found["fisheye"][1]).lower() in ("1", "1.0", "true") if "fisheye" in found else None
-    model = found.get("model", ("", "equidistant" if flag else None))[1]
-    if model in COEFFICIENTS and not (named or "D" in found):
-        raise ValueError(f"no coefficients of {model}: found {listed([key for key, _ in found.values()])}")
-    if not any([*D, *named.values()]):
-        model = model if model in COEFFICIENTS else "plumb_bob"
-    model = model or _only_model(D, named, is_pinhole=flag is False or bool(named.keys() & {"p1", "p2"}))
-    names = COEFFICIENTS.get(model, ())
-    given = dict(zip([*names, *map(str, range(len(D)))], D, strict=False)) if D else named
-    is_short = any(D[2:3] if model == "plumb_bob" else D) and len(D) < 4  # k3 or p1; or another model's
-    if is_short or any(value for name, value in given.items() if name not in names):
-        expected = f"{', '.join(names) or 'none'} for {model}, zero beyond"
-        raise ValueError(f"coefficients: got {D or named}; expected {expected}")
-    return model, [given.get(name, 0.0) for name in names]
-
-
-def _only_model(D: list[float], named: dict[str, float], is_pinhole: bool) -> str:
-    """The only model with coefficients of these names, or so many. Raises ValueError if there are two."""
-    if len(D) in (8, 12, 14) or (is_pinhole and "k6" in named):
-        return "rational_polynomial"
-    if len(D) == 5 or (is_pinhole and len(D) <= 4):
-        return "plumb_bob"
-    count = f"{len(D or named)} coefficients of no model"
-    raise ValueError(f"{count}; add distortion_model: plumb_bob (k1, k2, p1, p2) or equidistant (k1, k2, k3, k4)")

@@ -19,10 +19,10 @@ from typing import Annotated, get_args
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from phd_exp.records.choices import first_difference
-from phd_exp.records.errors import DatasetError, gist
+from phd_exp.records.errors import DatasetError, reading
 from phd_exp.records.files import read_jsonl, read_plain, require_plain, write_atomic
 from phd_exp.records.parsing import Record, parse_json
 from phd_exp.records.scenes import SampleRecord, Split
@@ -89,15 +89,11 @@ class DatasetFolder:
     @property
     def manifest(self) -> Manifest:
         """The manifest. Raises DatasetError if there is none, or if it cannot be read."""
-        try:
+        if not self.manifest_path.exists():
+            raise DatasetError(f"{self.root}: no data set here (manifest.json is missing); render it first")
+        remedy = "restore it, or move the folder away and render anew"
+        with reading(self.manifest_path, remedy, what="not a readable manifest"):
             return Manifest.model_validate_json(read_plain(self.manifest_path))
-        except FileNotFoundError:
-            raise DatasetError(f"{self.root}: no data set here (manifest.json is missing); render it first") from None
-        except (OSError, ValidationError) as error:
-            raise DatasetError(
-                f"{self.manifest_path}: not a readable manifest ({gist(error)}); restore it, or move the folder "
-                "away and render anew"
-            ) from None
 
     def write_manifest(self, manifest: Manifest) -> None:
         """Replace the manifest. Raises OSError if the folder cannot be written."""
@@ -133,15 +129,11 @@ class DatasetFolder:
         S = self.manifest.spec.sensor_size
         row = (CELLS, CELLS) if name == "masks.npy" else (S, -(-S // 8))
         file = self.root / name
-        try:
-            rows = mapped(file, (n, *row))
+        with reading(file, "write it by `python -m phd_exp render data=...` where the folder may be written"):
             version = file.with_suffix(".json")
             if not version.exists() or parse_json(read_plain(version).decode()) != DRAWING:
                 raise ValueError("drawn by another version of the program")
-            return rows
-        except (OSError, ValueError) as error:
-            remedy = "write it by `python -m phd_exp render data=...` where the folder may be written"
-            raise DatasetError(f"{file}: {gist(error)}; {remedy}") from None
+            return mapped(file, (n, *row))
 
     def missing(self, spec: DatasetSpec, n_train: int, n_test: int) -> dict[Split, list[int]]:
         """Indices of the wanted samples that are not finished, or whose image or line has gone, by split.

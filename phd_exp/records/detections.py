@@ -9,7 +9,7 @@ from os.path import commonpath
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import AfterValidator, Field, PlainValidator, ValidationError, model_validator
+from pydantic import Field, PlainValidator, ValidationError, model_validator
 
 from phd_exp.records.cameras import CORNER, SHORTEST, Calibration, Size, read_camera, require_narrow
 from phd_exp.records.errors import DatasetError, complaint
@@ -31,16 +31,10 @@ def _name(value: Any) -> int | str:
     return value
 
 
-def _in_pixels(f: float) -> float:
-    if f < SHORTEST:
-        raise ValueError(f"expected a focal length in pixels, at least {SHORTEST}")
-    return f
-
-
 FileName = Annotated[str, Field(min_length=1, max_length=1000)]
 NumberOrName = Annotated[int | str, PlainValidator(_name)]
 Pixels = Annotated[Number, Field(ge=-1e6, le=1e6)]
-FocalLength = Annotated[Positive, Field(le=1e6), AfterValidator(_in_pixels)]
+FocalLength = Annotated[Number, Field(ge=SHORTEST, le=1e6)]  # px
 Metres = Annotated[Number, Field(ge=-1e6, le=1e6)]
 
 

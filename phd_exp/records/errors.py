@@ -32,18 +32,8 @@ READABLE = "make it a readable file"
 NAMED = 5  # names that a message lists
 
 
-UNPACKED: dict[str, str] = {}
-"""Temporary folder of a packed run -> the folder of its file, which messages name instead."""
-
-
 class UserError(Exception):
     """An error that the user can fix; the command line prints it without a traceback."""
-
-    def __str__(self) -> str:
-        text = super().__str__()
-        for temporary, folder in UNPACKED.items():
-            text = text.replace(temporary, folder)
-        return text
 
 
 class ConfigError(UserError):
@@ -79,6 +69,25 @@ def writing(folder: Path, instead: str = "data.root", kind: type[UserError] = Re
             f"{error.filename or folder}: cannot be written ({error.strerror or error}); make room, allow writing, "
             f"or choose another {instead}"
         ) from error
+
+
+@contextmanager
+def reading(
+    where: object, otherwise: str = "", kind: type[UserError] = DatasetError, what: str = "cannot be read"
+) -> Iterator[None]:
+    """Convert any error in the body, which reads a file of others, to a UserError of a `kind`, one line.
+
+    The line has the place, the reason, and a remedy: `otherwise`, but READABLE if the system refuses to read the file.
+    A UserError passes unchanged. Parsers raise errors of many kinds on damaged files, hence `Exception`.
+    """
+    try:
+        yield
+    except UserError:
+        raise
+    except Exception as error:
+        refused = isinstance(error, OSError) and error.errno and not isinstance(error, FileNotFoundError)
+        remedy = f"; {READABLE if refused else otherwise}" if otherwise else ""
+        raise kind(f"{where}: {what} ({one_line(gist(error))}){remedy}") from error
 
 
 def listed(names: Sequence[str]) -> str:
@@ -159,13 +168,8 @@ def gist(error: BaseException) -> str:
         text = complaint(error.errors(include_url=False)[0])
     else:
         text = str(getattr(error, "strerror", None) or error) or type(error).__name__
-    return " ".join(text.split())[:LONGEST_GIST]
-
-
-def remedy(error: BaseException, otherwise: str = "") -> str:
-    """`; ` and what to do about a file that cannot be read: `otherwise` only if the system lets it be read."""
-    words = READABLE if getattr(error, "errno", None) else otherwise
-    return f"; {words}" if words else ""
+    missing = " is missing" if isinstance(error, KeyError) else ""
+    return " ".join(text.split())[:LONGEST_GIST] + missing
 
 
 def in_user_code(error: BaseException) -> str | None:

@@ -13,7 +13,7 @@ from itertools import count
 from pathlib import Path
 from typing import TextIO, TypeVar
 
-from phd_exp.records.errors import CorruptFileError, gist
+from phd_exp.records.errors import CorruptFileError, reading
 from phd_exp.records.parsing import parse_json
 
 Parsed = TypeVar("Parsed")
@@ -155,12 +155,10 @@ def read_jsonl(
     with open(path, "rb") as stream:
         for number in count(1) if limit is None else range(1, limit + 1):
             line = stream.readline(LONGEST_LINE + 1)
-            if len(line) > LONGEST_LINE:
-                raise CorruptFileError(f"{path}, line {number}: longer than {LONGEST_LINE} bytes")
-            if not line.endswith(b"\n") and not (line and sealed):
+            if not line.endswith(b"\n") and not (line and sealed) and len(line) <= LONGEST_LINE:
                 break
-            try:
+            with reading(f"{path}, line {number}", kind=CorruptFileError, what="not a valid record"):
+                if len(line) > LONGEST_LINE:
+                    raise ValueError(f"longer than {LONGEST_LINE} bytes")
                 records.append(parse(line.removesuffix(b"\n").decode()))
-            except ValueError as error:  # also UnicodeDecodeError and pydantic's ValidationError
-                raise CorruptFileError(f"{path}, line {number}: not a valid record ({gist(error)})") from error
     return records

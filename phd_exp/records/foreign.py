@@ -16,7 +16,6 @@ CameraUtility.py (the principal point); cocodataset.org/#format-data.
 
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
 from functools import partial
 from itertools import chain
 from os.path import normpath
@@ -27,7 +26,7 @@ import numpy as np
 from PIL import Image
 
 from phd_exp.records.cameras import CORNER
-from phd_exp.records.errors import DatasetError, gist, listed
+from phd_exp.records.errors import DatasetError, listed, reading
 from phd_exp.records.files import MB, read_plain
 from phd_exp.records.images import FORMATS, decoding, pillow_warnings
 from phd_exp.records.parsing import parse_json
@@ -46,14 +45,15 @@ COCO_FILES = {
     "result.json": "",  # Label Studio
 }
 """Annotations in COCO's format, relative to a folder whose name is {}, and the subfolder of their images."""
+OF_BOP = ("scene_*.json", "*.gt.json", "*.camera.json", "*.gt_info.json")
 
 
 def format_of(folder: Path) -> tuple[list[Path], Callable[[Path], Iterator[Entry]]] | None:
     """The annotation files of a folder and the reader of their format; None if it is neither."""
     if any(folder.glob("*/scene_gt*.json")) or any(folder.glob("*/*.gt.json")):
         listing = _targets(folder)
-        parts = [*folder.glob("*/scene_*.json"), *folder.glob("*/*.gt.json"), *folder.glob("*/*.camera.json")]
-        return sorted([*parts, *folder.glob("*/*.gt_info.json"), *([listing] if listing else [])]), _bop
+        found = [file for name in OF_BOP for file in folder.glob(f"*/{name}")]
+        return sorted([*found, *([listing] if listing else [])]), _bop
     for name, subfolder in COCO_FILES.items():
         file = Path(normpath(folder.absolute() / name.format(folder.absolute().name)))
         if file.exists():
@@ -70,16 +70,11 @@ def expected_in(folder: Path) -> str:
     if near := [str(place) for place in open_to_us if (place / "metadata.jsonl").exists() or format_of(place)]:
         return f"no annotations; expected one of the folders with annotations near it: {listed(near)}"
     coco = ", ".join(COCO_FILES).format(*[folder.absolute().name] * 2)
-    return (
-        f"no annotations; found {_names_in(folder)}; expected metadata.jsonl, */scene_gt.json (BOP), "
-        f"or one of {coco} (COCO); {RULE}; "
-        "predict takes images alone too, with f=PIXELS or camera=FILE"
-    )
-
-
-def _names_in(folder: Path) -> str:
     names = sorted(f"{file.name}/" if file.is_dir() else file.name for file in folder.glob("*"))
-    return listed(names) or "nothing"
+    return (
+        f"no annotations; found {listed(names) or 'nothing'}; expected metadata.jsonl, */scene_gt.json (BOP), or one "
+        f"of {coco} (COCO); {RULE}; predict takes images alone too, with f=PIXELS or camera=FILE"
+    )
 
 
 def _bop(folder: Path) -> Iterator[Entry]:
@@ -89,14 +84,14 @@ def _bop(folder: Path) -> Iterator[Entry]:
     """
     wanted, n, n_visible = None, 0, 0
     if listing := _targets(folder):
-        with _reading(listing):
+        with reading(listing, RULE):
             wanted = {(one["scene_id"], one["im_id"], one["obj_id"]) for one in _read(listing)}
     for image, file, camera, items, infos in chain(_scenewise(folder), _imagewise(folder)):
         scene = file.relative_to(folder).parts[0]
-        with _reading(f"{folder / scene}, image {image}"):
+        with reading(f"{folder / scene}, image {image}", RULE):
             pairs = list(zip(items, infos, strict=True))
         for number, (item, info) in enumerate(pairs):
-            with _reading(where := f"{folder / scene}, image {image}, object {number}"):
+            with reading(where := f"{folder / scene}, image {image}, object {number}", RULE):
                 model, n = item["obj_id"], n + 1
                 left, top, width, height = info["bbox_visib"]
                 # invisible objects have the box -1, -1, -1, -1
@@ -137,40 +132,32 @@ def _scenewise(folder: Path) -> Iterator[Pictured]:
         sensor = file.stem.removeprefix("scene_gt")
         if sensor.startswith("_info"):
             continue
-        folders = [
-            file.with_name(name) for name in (f"rgb{sensor}", sensor.removeprefix("_"), f"gray{sensor}") if name
-        ]
+        names = filter(None, (f"rgb{sensor}", sensor.removeprefix("_"), f"gray{sensor}"))
+        folders = [file.with_name(name) for name in names]
         place = next((one for one in folders if one.exists()), folders[-1])
-        pictures = {picture.stem: picture for picture in sorted(place.glob("*.*"))}
         calibrated, described = (file.with_name(f"scene_{name}{sensor}.json") for name in ("camera", "gt_info"))
-        scene, cameras = _by_image(file), _by_image(calibrated)
-        infos = _by_image(described) if described.exists() else None
-        for image, items in scene.items():
-            camera, picture = _of(image, calibrated, cameras), _of(f"{image:06d}", place, pictures)
-            masks = file.with_name(f"mask_visib{sensor}") / picture.stem
-            known = _of_masks(masks, len(items)) if infos is None else _of(image, described, infos)
-            yield image, picture, camera, items, known
-
-
-def _of(image: int | str, place: Path, found: dict[Any, Any]) -> Any:
-    with _reading(f"{place}, image {image}"):
-        return found[image]
+        pictures = {picture.stem: picture for picture in sorted(place.glob("*.*"))}
+        cameras, infos = _by_image(calibrated), _by_image(described) if described.exists() else None
+        for image, items in _by_image(file).items():
+            with reading(f"{file.parent}, image {image}", RULE):
+                camera, picture = cameras[image], pictures[f"{image:06d}"]
+                masks = file.with_name(f"mask_visib{sensor}") / picture.stem
+                yield image, picture, camera, items, _of_masks(masks, len(items)) if infos is None else infos[image]
 
 
 def _imagewise(folder: Path) -> Iterator[Pictured]:
     for file in sorted(folder.glob("*/*.gt.json")):
         stem = file.name.removesuffix(".gt.json")
         items, camera, known = (_read(file.with_name(f"{stem}.{name}.json")) for name in ("gt", "camera", "gt_info"))
-        with _reading(file):
+        with reading(file, RULE):
             pictures = sorted([*file.parent.glob(f"{stem}.rgb.*"), *file.parent.glob(f"{stem}.gray.*")])
             yield int(stem.rpartition("_")[2]), pictures[0], camera, items, known
 
 
 def _by_image(file: Path) -> dict[int, Any]:
     """The values by the number of the image, whose key may have zeros before it."""
-    content = _read(file)
-    with _reading(file):
-        return {int(image): value for image, value in content.items()}
+    with reading(file, RULE):
+        return {int(image): value for image, value in _read(file).items()}
 
 
 def _of_masks(masks: Path, n: int) -> Iterator[dict[str, Any]]:
@@ -186,13 +173,13 @@ def _of_masks(masks: Path, n: int) -> Iterator[dict[str, Any]]:
 def _coco(file: Path, subfolder: str, folder: Path) -> Iterator[Entry]:
     """All annotations except crowds."""
     content = _read(file)
-    with _reading(file):
+    with reading(file, RULE):
         if not isinstance(content, dict):
             raise ValueError("expected an object with images, annotations and categories; export it as COCO")
         images, categories = _by_id(content["images"]), _by_id(content["categories"])
-        items = list(enumerate(content["annotations"]))
-    for number, item in items:
-        with _reading(where := f"{file}, annotation {number}"):
+        items = list(content["annotations"])
+    for number, item in enumerate(items):
+        with reading(where := f"{file}, annotation {number}", RULE):
             if _is_crowd(item):
                 continue
             image = images[str(item["image_id"])]
@@ -208,10 +195,10 @@ def _coco(file: Path, subfolder: str, folder: Path) -> Iterator[Entry]:
 
 def _by_id(items: Sequence[dict[str, Any]]) -> dict[str, dict[str, Any]]:
     """The items by their id as text, since some programs write it as such in one place and not in another."""
-    found = {str(item["id"]): item for item in items}
-    if len(found) < len(items):
-        ids = [str(item["id"]) for item in items]
-        raise ValueError(f"the id {next(id for id in ids if ids.count(id) > 1)} is given twice")
+    found: dict[str, dict[str, Any]] = {}
+    for item in items:
+        if found.setdefault(str(item["id"]), item) is not item:
+            raise ValueError(f"the id {item['id']} is given twice")
     return found
 
 
@@ -236,16 +223,17 @@ def boxes_of_images(file: Path, category: int | str | None = None) -> dict[str, 
 
     Raises DatasetError if the file cannot be read, or has no box of the category.
     """
-    items = _read(file)
     found: dict[str, list[dict[str, Any]]] = {}
     others = set()
-    with _reading(file):
-        items = items["annotations"] if isinstance(items, dict) else items
-        if not all(isinstance(item, dict) for item in items):
-            raise ValueError("expected a list of {bbox: [x, y, width, height], category_id: ...}")
-        items = [item for item in items if not _is_crowd(item)]
+    with reading(file, RULE):
+        content = _read(file)
+        items = list(content["annotations"] if isinstance(content, dict) else content)
     for number, item in enumerate(items):
-        with _reading(f"{file}, box {number}"):
+        with reading(
+            f"{file}, box {number}", f"expected [{{bbox: [x, y, width, height], category_id: ...}}]; {RULE}"
+        ):
+            if _is_crowd(item):
+                continue
             if category is None or str(item["category_id"]) == str(category):
                 given = {key: item[key] for key in ("score", "category_id") if key in item}
                 found.setdefault(str(item.get("image_id")), []).append({"box": edges(item["bbox"]), **given})
@@ -263,18 +251,8 @@ def edges(bbox: Sequence[float]) -> list[float]:
     return [x, y, x + width, y + height]
 
 
-@contextmanager
-def _reading(where: Path | str) -> Iterator[None]:
-    """Turn whatever is wrong with a file into one line."""
-    try:
-        yield
-    except (OSError, LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
-        reason = f"{gist(error)} is missing" if isinstance(error, KeyError) else gist(error)
-        raise DatasetError(f"{where}: cannot be read ({reason}); {RULE}") from None
-
-
 def _read(file: Path) -> Any:
-    with _reading(file):
+    with reading(file, RULE):
         return parse_json(read_plain(file, LARGEST).decode("utf-8-sig"))
 
 

@@ -1,9 +1,7 @@
 """Image files, possibly made by a stranger: decoded within limits, or refused in one line."""
 
 import io
-import struct
 import warnings
-import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,7 +9,7 @@ from pathlib import Path
 from PIL import Image, Jpeg2KImagePlugin, TiffImagePlugin, UnidentifiedImageError, WebPImagePlugin
 
 from phd_exp.records.dataset import sha256
-from phd_exp.records.errors import DatasetError, gist
+from phd_exp.records.errors import DatasetError, reading
 from phd_exp.records.files import MB, read_plain
 from phd_exp.records.scenes import SampleRecord
 
@@ -23,10 +21,6 @@ SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".gif", "
 """Endings of their names, to find the images in a folder with other files."""
 RENDERED = ("PNG", "WEBP", "JPEG")
 LARGEST_IMAGE = 256 * MB  # bytes of an image file
-BROKEN = (
-    OSError, SyntaxError, ValueError, LookupError, EOFError, OverflowError, MemoryError, struct.error, zlib.error,
-)  # fmt: skip
-"""Exceptions of Pillow's decoders on broken files."""
 
 
 @contextmanager
@@ -40,27 +34,18 @@ def pillow_warnings() -> Iterator[None]:
 
 @contextmanager
 def decoding(file: Path) -> Iterator[None]:
-    """Turn the errors of decoding an image into a DatasetError, one line that names the file."""
-    try:
-        yield
-    except (Image.DecompressionBombError, Image.DecompressionBombWarning):
-        raise DatasetError(
-            f"{file}: has more pixels than Pillow's limit of {Image.MAX_IMAGE_PIXELS} lets pass; shrink it, and with "
-            "it f, cx, cy and box"
-        ) from None
-    except UnidentifiedImageError:
-        kinds = ", ".join(FORMATS)
-        raise DatasetError(f"{file}: not an image of any kind that is read here ({kinds})") from None
-    except BROKEN as error:
-        raise DatasetError(f"{file}: cannot be read as an image ({gist(error)}); replace it") from None
+    """Convert the errors of decoding an image, which Pillow limits in pixels, to a DatasetError that names the file."""
+    with reading(file, f"expected a whole image ({', '.join(FORMATS)})", what="cannot be read as an image"):
+        try:
+            yield
+        except UnidentifiedImageError:
+            raise ValueError("of another kind") from None
 
 
 def content_of(file: Path) -> bytes:
     """The bytes of an image file. Raises DatasetError if it cannot be read."""
-    try:
+    with reading(file):
         return read_plain(file, LARGEST_IMAGE)
-    except OSError as error:
-        raise DatasetError(f"{file}: cannot be read ({error.strerror})") from None
 
 
 def recorded_image(path: Path, record: SampleRecord) -> Image.Image:
@@ -71,17 +56,12 @@ def recorded_image(path: Path, record: SampleRecord) -> Image.Image:
             adds the remedy.
     """
     content = content_of(path)
-    if sha256(content) != record.sha256:
-        raise DatasetError(f"{path}: its checksum is not the recorded one")
-    try:
+    with decoding(path):
+        if sha256(content) != record.sha256:
+            raise DatasetError(f"{path}: its checksum is not the recorded one")
         image = Image.open(io.BytesIO(content), formats=RENDERED)
         # before decoding, because a small file may expand to more pixels than memory holds
-        if image.size != (record.S, record.S):
-            width, height = image.size
-            raise DatasetError(f"{path}: {width} x {height} pixels, {record.S} x {record.S} recorded")
-        if image.mode != "RGB":
-            raise DatasetError(f"{path}: its pixels are of the kind {image.mode!r}; expected RGB of 8 bits")
+        if (*image.size, image.mode) != (record.S, record.S, "RGB"):
+            raise ValueError(f"{image.size} pixels of {image.mode}; expected {record.S} x {record.S} of RGB")
         image.load()
-    except (*BROKEN, Image.DecompressionBombError) as error:
-        raise DatasetError(f"{path}: cannot be decoded ({' '.join(str(error).split())})") from None
     return image

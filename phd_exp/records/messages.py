@@ -40,6 +40,8 @@ VISION = {
     "Detection3DArray": "std_msgs/Header header\nDetection3D[] detections",
 }
 """The fields of vision_msgs, which rosbags does not have."""
+Content = dict[str, Any]
+"""The fields of a message, nested."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,42 +124,36 @@ class MessageFile:
 
     def positions(self, time: int, frame: str, objects: Sequence[Located]) -> None:
         """Write `/detections`, and `/position` for each object."""
-        header = _header(time, frame)
-        detections = []
+        header, detections = _header(time, frame), []
         for one in objects:
-            pose = _pose(one)
-            hypothesis = _made("vision_msgs/msg/ObjectHypothesis", class_id=one.class_id, score=one.score)
-            result = _made("vision_msgs/msg/ObjectHypothesisWithPose", hypothesis=hypothesis, pose=pose)
-            box = _made("vision_msgs/msg/BoundingBox3D", center=pose.pose, size=_vector(np.zeros(3)))
-            named = {"header": header, "results": [result], "bbox": box, "id": one.id}
-            detections.append(_made("vision_msgs/msg/Detection3D", **named))
-            self._write(
-                "/position", time, _made("geometry_msgs/msg/PoseWithCovarianceStamped", header=header, pose=pose)
-            )
-        self._write(
-            "/detections", time, _made("vision_msgs/msg/Detection3DArray", header=header, detections=detections)
-        )
+            pose, hypothesis = _pose(one), {"class_id": one.class_id, "score": one.score}
+            box = {"center": pose["pose"], "size": _numbers("xyz", np.zeros(3))}
+            results = [{"hypothesis": hypothesis, "pose": pose}]
+            detections.append({"header": header, "results": results, "bbox": box, "id": one.id})
+            stamped = {"header": header, "pose": pose}
+            self._write("/position", time, "geometry_msgs/msg/PoseWithCovarianceStamped", stamped)
+        found = {"header": header, "detections": detections}
+        self._write("/detections", time, "vision_msgs/msg/Detection3DArray", found)
 
     def photograph(self, time: int, frame: str, camera: str, photograph: Photograph) -> None:
         """Write `/CAMERA/image_raw/compressed` and `/CAMERA/camera_info`."""
         header, data = _header(time, frame), np.frombuffer(photograph.content, np.uint8)
-        image = _made(COMPRESSED, header=header, format=photograph.format, data=data)
-        self._write(f"/{camera}/image_raw/compressed", time, image)
-        self._write(f"/{camera}/camera_info", time, _camera_info(header, photograph))
+        image = {"header": header, "format": photograph.format, "data": data}
+        self._write(f"/{camera}/image_raw/compressed", time, COMPRESSED, image)
+        self._write(f"/{camera}/camera_info", time, INFO, {"header": header} | _camera(photograph))
 
     def pose(self, time: int, frame: str, place: Float[np.ndarray, "3"], turn: Float[np.ndarray, "4"]) -> None:
         """Write `/tf`: the place (m) of a frame in the world, and the quaternion (x, y, z, w) of its axes."""
-        transform = _made("geometry_msgs/msg/Transform", translation=_vector(place), rotation=_quaternion(turn))
-        named = {"header": _header(time, WORLD), "child_frame_id": frame, "transform": transform}
-        stamped = _made("geometry_msgs/msg/TransformStamped", **named)
-        self._write("/tf", time, _made("tf2_msgs/msg/TFMessage", transforms=[stamped]))
+        transform = {"translation": _numbers("xyz", place), "rotation": _numbers("xyzw", turn)}
+        stamped = {"header": _header(time, WORLD), "child_frame_id": frame, "transform": transform}
+        self._write("/tf", time, "tf2_msgs/msg/TFMessage", {"transforms": [stamped]})
 
-    def _write(self, topic: str, time: int, message: Any) -> None:
-        store, kind = typestore(), message.__msgtype__
+    def _write(self, topic: str, time: int, kind: str, content: Content) -> None:
+        store = typestore()
         if topic not in self._connections:
             self._connections[topic] = self._writer.add_connection(topic, kind, typestore=store)
         with writing(self.file, "out=", UserError):
-            self._writer.write(self._connections[topic], time, store.serialize_cdr(message, kind))
+            self._writer.write(self._connections[topic], time, store.serialize_cdr(_message(kind, content), kind))
 
     def __enter__(self) -> Self:
         return self
@@ -172,46 +168,44 @@ class MessageFile:
                 os.replace(Path(self._folder.name) / "all" / "all.mcap", self.file)
 
 
-def _made(kind: str, **fields: Any) -> Any:
-    return typestore().types[kind](**fields)
+def _message(kind: str, content: Content) -> Any:
+    """The message of a type with the fields in nested mappings."""
+    fields = dict(typestore().fielddefs[kind][1])
+    return typestore().types[kind](**{name: _field(fields[name][1], value) for name, value in content.items()})
 
 
-def _header(time: int, frame: str) -> Any:
-    seconds, nanoseconds = divmod(time, SECOND)
-    stamp = _made("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds)
-    return _made("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
+def _field(kind: Any, value: Any) -> Any:
+    if isinstance(value, dict):
+        return _message(kind, value)
+    return [_message(kind[0][1], item) for item in value] if isinstance(value, list) else value
 
 
-def _vector(xyz: Float[np.ndarray, "3"], kind: str = "Vector3") -> Any:
-    return _made(f"geometry_msgs/msg/{kind}", **dict(zip("xyz", map(float, xyz), strict=True)))
+def _header(time: int, frame: str) -> Content:
+    return {"stamp": {"sec": time // SECOND, "nanosec": time % SECOND}, "frame_id": frame}
 
 
-def _quaternion(xyzw: Float[np.ndarray, "4"]) -> Any:
-    return _made("geometry_msgs/msg/Quaternion", **dict(zip("xyzw", map(float, xyzw), strict=True)))
+def _numbers(names: str, values: Float[np.ndarray, " numbers"]) -> Content:
+    return dict(zip(names, map(float, values), strict=True))
 
 
-def _pose(located: Located) -> Any:
+def _pose(located: Located) -> Content:
     """The axes are those of the frame, with variances that say how little this means."""
     covariance = np.diag([0.0, 0.0, 0.0, UNKNOWN, UNKNOWN, UNKNOWN])
     covariance[:3, :3] = located.covariance
-    no_turn = _quaternion(np.array([0.0, 0.0, 0.0, 1.0]))
-    pose = _made("geometry_msgs/msg/Pose", position=_vector(located.mean, "Point"), orientation=no_turn)
-    return _made("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=covariance.ravel())
+    no_turn = _numbers("xyzw", np.array([0.0, 0.0, 0.0, 1.0]))
+    pose = {"position": _numbers("xyz", located.mean), "orientation": no_turn}
+    return {"pose": pose, "covariance": covariance.ravel()}
 
 
-def _camera_info(header: Any, photograph: Photograph) -> Any:
-    """The intrinsics; ROS counts pixels from the centre of the first one."""
+def _camera(photograph: Photograph) -> Content:
+    """The fields of a `camera_info`; ROS counts pixels from the centre of the first one."""
     (width, height), lens = photograph.size, photograph.lens
     K = photograph.K - CORNER * np.array([[0, 0, 1], [0, 0, 1], [0, 0, 0]])
-    model = (
-        "equidistant" if lens.is_fisheye else "plumb_bob" if len(lens.coefficients) <= 5 else "rational_polynomial"
-    )
+    of_pinhole = "plumb_bob" if len(lens.coefficients) <= 5 else "rational_polynomial"
+    model = "equidistant" if lens.is_fisheye else of_pinhole
     D = np.zeros(len(COEFFICIENTS[model]))
     D[: len(lens.coefficients)] = lens.coefficients
+    matrices = {"d": D, "k": K.ravel(), "r": np.eye(3).ravel(), "p": np.c_[K, np.zeros(3)].ravel()}
     region = dict.fromkeys(("x_offset", "y_offset", "height", "width"), 0) | {"do_rectify": False}
-    return _made(
-        INFO,
-        header=header, height=height, width=width, distortion_model=model, d=D, k=K.ravel(), r=np.eye(3).ravel(),
-        p=np.c_[K, np.zeros(3)].ravel(), binning_x=0, binning_y=0,
-        roi=_made("sensor_msgs/msg/RegionOfInterest", **region),
-    )  # fmt: skip
+    readout = {"binning_x": 0, "binning_y": 0, "roi": region}
+    return {"height": height, "width": width, "distortion_model": model} | matrices | readout

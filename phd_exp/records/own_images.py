@@ -17,12 +17,14 @@ from pathlib import Path
 from phd_exp.records.cameras import Calibration, read_camera
 from phd_exp.records.dataset import sha256
 from phd_exp.records.detections import Detection, line_of
-from phd_exp.records.errors import CONTROLS, DatasetError, gist, listed, shown
+from phd_exp.records.errors import CONTROLS, DatasetError, listed, reading, shown
 from phd_exp.records.files import checksum, read_jsonl
 from phd_exp.records.foreign import Entry, expected_in, format_of
 from phd_exp.records.images import SUFFIXES
 from phd_exp.records.parsing import parse_json
 from phd_exp.records.scenes import Pose, Split
+
+ONE_A_LINE = "expected one object a line"
 
 
 @dataclass(frozen=True)
@@ -43,20 +45,18 @@ class DetectionFolder:
 
 
 def fingerprint(*folders: Path) -> str:
-    """Checksum of the annotations and camera files of folders, without the images.
+    """Checksum of the annotations of folders and of the camera files that they name, without the images.
 
     Raises OSError if a file cannot be read, DatasetError if a line is not JSON.
     """
-    files = [file for folder in folders for file in (*annotations(folder)[0], *_cameras(folder))]
-    return sha256("".join(map(checksum, files)).encode())
-
-
-def _cameras(folder: Path) -> list[Path]:
-    """The camera files that the lines of a folder's `metadata.jsonl` name."""
-    path = folder / "metadata.jsonl"
-    lines = [values for _, _, values in _entries(folder)] if path.exists() else []
-    names = {line["camera"] for line in lines if isinstance(line, dict) and isinstance(line.get("camera"), str)}
-    return [_inside(folder, name, str(path), "camera") for name in sorted(names)]
+    sums: list[str] = []
+    for folder in folders:
+        files, read = annotations(folder)
+        sums += map(checksum, files)
+        lines = [values for _, _, values in read(folder) if isinstance(values, dict)] if read is _entries else []
+        names = sorted({line["camera"] for line in lines if isinstance(line.get("camera"), str)})
+        sums += [checksum(_inside(folder, name, str(files[0]), "camera")) for name in names]
+    return sha256("".join(sums).encode())
 
 
 def detections_in(
@@ -111,19 +111,14 @@ def annotations(folder: Path) -> tuple[list[Path], Callable[[Path], Iterator[Ent
 
 def _entries(folder: Path) -> Iterator[Entry]:
     path = folder / "metadata.jsonl"
-    try:
+    if not os.path.lexists(path):
+        raise DatasetError(f"{folder}: {expected_in(folder)}")
+    with reading(path, ONE_A_LINE):
         lines = read_jsonl(path, lambda text: text.removeprefix("\ufeff").strip(), sealed=True)
-    except FileNotFoundError:
-        raise DatasetError(f"{folder}: {expected_in(folder)}") from None
-    except OSError as error:
-        raise DatasetError(f"{path}: cannot be read ({error.strerror}); expected one JSON object a line") from None
     for number, text in enumerate(lines, start=1):
-        where = f"{path}, line {number}"
-        try:
+        with reading(where := f"{path}, line {number}", ONE_A_LINE, what="not JSON"):
             if text:
                 yield where, "", parse_json(text)
-        except ValueError as error:
-            raise DatasetError(f"{where}: not JSON ({error}); expected one object a line") from None
 
 
 @dataclass(frozen=True)
@@ -148,15 +143,11 @@ def observed(detections: Sequence[Detection]) -> list[Observed]:
     views: dict[int | str, list[tuple[Detection, Pose]]] = {}
     for detection in detections:
         scene, pose = detection.line.scene, detection.line.pose
-        if scene is None:
+        if scene is None or pose is None:
             raise DatasetError(
-                f"{detection.where}: scene is missing; expected the same number or name on all lines that show the "
-                "same object at the same time"
-            )
-        if pose is None:
-            raise DatasetError(
-                f"{detection.where}: pose is missing; expected the rotation [w, x, y, z] and translation of its "
-                "camera, R v + t from the world to the camera"
+                f"{detection.where}: scene or pose is missing; expected on all lines that show the same object at the "
+                "same time the same scene, a number or name, and the pose of the camera: the rotation [w, x, y, z] "
+                "and translation of R v + t from the world to the camera"
             )
         views.setdefault(scene, []).append((detection, pose))
     return [Observed(scene, *map(tuple, zip(*pairs, strict=True))) for scene, pairs in views.items()]
@@ -172,13 +163,10 @@ def tracks_of(detections: Sequence[Detection]) -> dict[int | str | None, list[De
 
 def _inside(folder: Path, name: str, where: str, key: str = "file_name") -> Path:
     """The file; a stranger's data set must not read files outside its folder."""
-    try:
+    with reading(where, what=f"{key}={shown(name)} is no file name"):  # also a link to itself, or too long a name
         if CONTROLS.search(name):
             raise ValueError("control characters")
-        leaves = Path(name).is_absolute() or ".." in Path(name).parts
-        leaves = leaves or not (folder / name).resolve().is_relative_to(folder.resolve())
-    except (ValueError, OSError, RuntimeError) as error:  # also a link to itself, or too long a name
-        raise DatasetError(f"{where}: {key}={shown(name)} is no file name ({gist(error)})") from None
-    if leaves:
-        raise DatasetError(f"{where}: {key}={name!r} leaves {folder}; expected a path below it")
+        is_below = (folder / name).resolve().is_relative_to(folder.resolve())
+        if not is_below or ".." in Path(name).parts or Path(name).is_absolute():
+            raise ValueError(f"leaves {folder}; expected a path below it")
     return folder / name

@@ -22,7 +22,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from zipfile import ZIP_STORED, ZipFile, ZipInfo
 
-from phd_exp.records.errors import UNPACKED, RunError, gist, shown
+from phd_exp.records.errors import RunError, reading, shown
 from phd_exp.records.files import MB, require_plain, write_atomic
 from phd_exp.records.runs import RunFolder
 
@@ -81,12 +81,9 @@ def opened(path: Path) -> RunFolder:
         return RunFolder(path)
     outer = Path(tempfile.mkdtemp(prefix="phd_exp-"))
     folder = RunFolder(outer / path.name)
-    UNPACKED[f"{outer}/"] = f"{path.parent}/".removeprefix("./")  # so that messages name the archive
     weakref.finalize(folder, shutil.rmtree, outer, ignore_errors=True)
-    try:
+    with reading(path, "expected a file of `pack`", RunError, "not the archive of a run"):
         _unpack(path, folder.path)
-    except Exception as error:  # zipfile raises any on other bytes
-        raise RunError(f"{path}: not the archive of a run ({gist(error)}); expected a file of `pack`") from None
     return folder
 
 

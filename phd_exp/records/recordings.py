@@ -15,24 +15,26 @@ from typing import Any
 
 import numpy as np
 from PIL import Image
-from pydantic import ValidationError
 
 from phd_exp.records.cameras import Calibration, calibration_in, read_camera
 from phd_exp.records.detections import Detection, RecordedImage, line_of
-from phd_exp.records.errors import DatasetError, UserError, gist, listed, one_line, shown
+from phd_exp.records.errors import DatasetError, listed, reading, shown
 from phd_exp.records.files import require_plain
 from phd_exp.records.images import FORMATS, decoding, pillow_warnings
 from phd_exp.records.messages import COMPRESSED, INFO, RAW, SECOND, require_rosbags, typestore
 
 MCAP = ".mcap"
-ROS_1 = ".bag"
-FILES = (MCAP, ".db3", ROS_1)
+FILES = (MCAP, ".db3", ".bag")
 GREY, RGB, BGR = [0], [0, 1, 2], [2, 1, 0]
 ENCODINGS = {
     **{"mono8": (1, GREY), "8UC1": (1, GREY), "mono16": (2, GREY)},
     **{"rgb8": (3, RGB), "bgr8": (3, BGR), "8UC3": (3, BGR), "rgba8": (4, RGB), "bgra8": (4, BGR)},
 }
 """Encoding of an image that is not compressed -> bytes a pixel, and the places of its colours; 8UC3 as in OpenCV."""
+DAMAGED = (
+    "copy the file again; if its writer was interrupted, `mcap recover` or `ros2 bag reindex` repairs it; bags of ROS "
+    "1 need `rosbags-convert`"
+)
 RECTIFIED = "image_rect"
 """Beginning of the names of topics whose images have no distortion, and the camera P instead of K."""
 
@@ -149,10 +151,8 @@ def _calibration(path: Path, images: str, infos: str, message: Any, image: tuple
     camera = {"K": message.k.tolist(), "D": message.d.tolist(), "distortion_model": message.distortion_model}
     if images.removesuffix("/compressed").rpartition("/")[2].startswith(RECTIFIED):
         camera = {"K": message.p.reshape(3, 4)[:, :3].ravel().tolist(), "D": []}
-    try:
+    with reading(f"{path}, {infos}", "expected a calibrated camera, or camera=FILE"):
         return calibration_in(sensor | camera, image)
-    except (ValueError, ValidationError) as error:
-        raise DatasetError(f"{path}, {infos}: {gist(error)}; expected a calibrated camera, or camera=FILE") from None
 
 
 def _size_of(message: Any) -> tuple[int, int] | None:
@@ -175,13 +175,12 @@ def _image_file(where: str, message: Any) -> bytes:
     if message.__msgtype__ == COMPRESSED:
         return bytes(message.data)
     encoding = message.encoding
-    bands, colours = ENCODINGS.get(encoding, (0, GREY))
-    if not bands:
-        remedy = "debayer it with image_proc" if "bayer" in encoding else "convert it with cv_bridge"
+    if encoding not in ENCODINGS:
         raise DatasetError(
             f"{where}: got the encoding {shown(encoding)}; expected {', '.join(ENCODINGS)}, or a compressed image; "
-            f"{remedy}"
+            "convert it with image_proc or cv_bridge"
         )
+    bands, colours = ENCODINGS[encoding]
     height, width, step = message.height, message.width, message.step
     if not 0 < width * bands <= step or height * step != len(message.data):
         raise DatasetError(
@@ -208,14 +207,9 @@ def _first(path: Path, topic: str) -> tuple[int, Any]:
 def _messages(path: Path, topics: list[str]) -> Iterator[tuple[int, str, Any]]:
     """The messages of some topics: time of recording (ns), topic, and content."""
     with _opened(path) as reader:
-        found = iter(reader.messages([one for one in reader.connections if one.topic in topics]))
-        while True:
-            with _reading(path):
-                if (one := next(found, None)) is None:
-                    return
-                connection, time, data = one
-                message = typestore().deserialize_cdr(data, _kind(connection))
-            yield time, connection.topic, message
+        wanted = [one for one in reader.connections if one.topic in topics]
+        for connection, time, data in reader.messages(wanted):
+            yield time, connection.topic, typestore().deserialize_cdr(data, _kind(connection))
 
 
 def _kind(connection: Any) -> str:
@@ -226,35 +220,14 @@ def _kind(connection: Any) -> str:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
-    """The recording as rosbags reads it."""
+    """The recording as rosbags reads it; errors in the body are those of the recording."""
     from rosbags.rosbag2 import Reader
 
-    if path.suffix == ROS_1:
-        raise DatasetError(f"{path}: a bag of ROS 1; `rosbags-convert --src {path} --dst FOLDER` makes one of ROS 2")
-    with _reading(path):
+    with reading(path, DAMAGED, what="cannot be read as a recording of ROS 2"):
         if not path.is_dir():
             require_plain(path)
-        reader = Reader(path)
-        reader.open()
-    try:
-        yield reader
-    finally:
-        reader.close()
-
-
-@contextmanager
-def _reading(path: Path) -> Iterator[None]:
-    """Turn any error into a DatasetError: rosbags has errors of many kinds for damaged files."""
-    try:
-        yield
-    except UserError:
-        raise
-    except Exception as error:
-        reason = one_line(gist(error))
-        raise DatasetError(
-            f"{path}: cannot be read as a recording of ROS 2 ({reason}); copy the file again; if its writer was "
-            "interrupted, `mcap recover` or `ros2 bag reindex` repairs it"
-        ) from None
+        with Reader(path) as reader:
+            yield reader
 
 
 Detections = Sequence[Detection] | Recording

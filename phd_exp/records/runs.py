@@ -26,24 +26,23 @@ import os
 import platform
 import subprocess
 import traceback
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import yaml
-from pydantic import AwareDatetime, Field, FiniteFloat, TypeAdapter, ValidationError
+from pydantic import AwareDatetime, BaseModel, Field, FiniteFloat, StrictInt
 
-from phd_exp.records.errors import RunError, gist, remedy, writing
+from phd_exp.records.errors import RunError, reading, writing
 from phd_exp.records.files import MB, read_jsonl, read_plain, write_atomic
 from phd_exp.records.parsing import Record, parse_json, parse_yaml
 from phd_exp.records.processes import held, machine
 
 AGAIN = "delete the folder to run again"
-LAST_EPOCH = 10**9
 HELD_OUT = "-held-out"  # of sequences of another seed, which choose the motion and the slow errors
 UNSHIFTED = "home"  # the unchanged test samples, among shifts
 SECTIONS = ("data", "model", "camera", "recipe", "backbone", "loss", "optimizer", "trainer", "evaluation")
@@ -51,8 +50,6 @@ SECTIONS = ("data", "model", "camera", "recipe", "backbone", "loss", "optimizer"
 LARGEST = MB  # bytes of a configuration or of a run's numbers
 PACKAGES = ("phd_exp", "torch", "torchvision", "lightning", "hydra-core", "numpy")
 """Packages on which numbers depend, whose versions are recorded."""
-
-_NUMBERS: TypeAdapter[dict[str, int | float | None]] = TypeAdapter(dict[str, int | FiniteFloat | None])
 
 State = Literal["running", "finished", "failed", "interrupted"]
 
@@ -75,6 +72,18 @@ class RunStatus(Record):
     custom: dict[str, str] = Field(default_factory=dict)
     overrides: list[str] = Field(default_factory=list)
     machine: str
+
+
+class Epoch(BaseModel, extra="allow"):
+    """A line of `metrics.jsonl`: the epoch, -1 before the first, and numbers by their names."""
+
+    __pydantic_extra__: dict[str, StrictInt | FiniteFloat | None] = Field(init=False)
+    epoch: Annotated[StrictInt, Field(ge=-1, le=10**9)]
+
+    @classmethod
+    def parsed(cls, text: str) -> dict[str, Any]:
+        """The numbers of a line. Raises ValueError if they are none."""
+        return cls.model_validate(parse_json(text)).model_dump()
 
 
 def choosing(columns: Mapping[str, Any]) -> np.ndarray:
@@ -150,10 +159,8 @@ class RunFolder:
         """The recorded status, or None. Raises RunError if it cannot be read."""
         if not self.status_file.exists():
             return None
-        try:
+        with reading(self.status_file, AGAIN, RunError, "not a run status"):
             return RunStatus.model_validate_json(read_plain(self.status_file))
-        except (ValidationError, OSError) as error:
-            raise _unreadable(self.status_file, "not a run status", error) from None
 
     def is_finished(self) -> bool:
         """Whether the run ended without an error. Raises RunError if its status cannot be read."""
@@ -192,7 +199,7 @@ class RunFolder:
 
         Raises CorruptFileError for an invalid line, OSError if the file cannot be read.
         """
-        return read_jsonl(self.metrics_file, _metrics_row) if self.metrics_file.exists() else []
+        return read_jsonl(self.metrics_file, Epoch.parsed) if self.metrics_file.exists() else []
 
     def write_config(self, config: Mapping[str, Any]) -> None:
         """Write the configuration, resolved."""
@@ -204,10 +211,8 @@ class RunFolder:
 
     def write_results(self, results: Mapping[str, Any]) -> None:
         """Write the final numbers, with null for those that are not finite, which JSON lacks."""
-        finite = {
-            key: None if isinstance(value, float) and not math.isfinite(value) else value
-            for key, value in results.items()
-        }
+        infinite = {key for key, value in results.items() if isinstance(value, float) and not math.isfinite(value)}
+        finite = {**results, **dict.fromkeys(infinite)}
         write_atomic(self.results_file, json.dumps(finite, indent=2, allow_nan=False) + "\n")
 
     def write_status(self, status: RunStatus) -> None:
@@ -283,28 +288,12 @@ def find_runs(runs: Path) -> list[RunFolder]:
     return [RunFolder(file.parent) for file in sorted(runs.glob("*/*/*/seed*/status.json"))]
 
 
-def _metrics_row(text: str) -> dict[str, Any]:
-    row = _NUMBERS.validate_python(parse_json(text), strict=True)
-    epoch = row.get("epoch")
-    if not isinstance(epoch, int) or not -1 <= epoch <= LAST_EPOCH:
-        raise ValueError(f"epoch: expected a whole number from -1 to {LAST_EPOCH}")
-    return row
-
-
-def _read_mapping(file: Path, parse: Any) -> dict[str, Any]:
-    try:
+def _read_mapping(file: Path, parse: Callable[[str], Any]) -> dict[str, Any]:
+    with reading(file, AGAIN, RunError):
         content = parse(read_plain(file, LARGEST).decode())
-    except FileNotFoundError:
-        raise RunError(f"{file}: missing; the run has not written it yet") from None
-    except (ValueError, OSError) as error:
-        raise _unreadable(file, "cannot be read", error) from None
-    if not isinstance(content, dict):
-        raise RunError(f"{file}: expected a mapping, found {type(content).__name__}")
-    return content
-
-
-def _unreadable(file: Path, complaint: str, error: Exception) -> RunError:
-    return RunError(f"{file}: {complaint} ({gist(error)}){remedy(error, AGAIN)}")
+        if not isinstance(content, dict):
+            raise ValueError(f"a {type(content).__name__}; expected a mapping")
+        return content
 
 
 def versions() -> dict[str, str]:
@@ -319,8 +308,6 @@ def versions() -> dict[str, str]:
 def git_commit() -> str | None:
     """The commit of this package's checkout, or None outside one or without git."""
     command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "HEAD"]
-    try:
-        answer = subprocess.run(command, capture_output=True, text=True, timeout=10)
-    except (OSError, subprocess.TimeoutExpired):
-        return None
-    return answer.stdout.strip() if answer.returncode == 0 else None
+    with suppress(OSError, subprocess.SubprocessError):
+        return subprocess.run(command, capture_output=True, text=True, timeout=10, check=True).stdout.strip()
+    return None

@@ -1,6 +1,5 @@
 """Video files, decoded and encoded one frame at a time by PyAV, which the extra `video` installs."""
 
-import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from fractions import Fraction
@@ -12,7 +11,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from jaxtyping import UInt8
 
-from phd_exp.records.errors import ConfigError, DatasetError, gist
+from phd_exp.records.errors import ConfigError, reading
 from phd_exp.records.files import require_plain
 
 CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg,flv,asf,ogg,mxf"
@@ -20,6 +19,7 @@ CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg,flv,asf,ogg,
 LONGEST_WAIT = 30.0  # seconds for one packet; signals are handled between packets
 CLOCK = 90_000  # ticks a second of a written video, as in broadcasting
 FRAGMENTED = {"movflags": "frag_keyframe+empty_moov+default_base_moof"}  # what is written can be played after a kill
+WHOLE = "expected a whole file of MP4, MOV, MKV, WEBM, AVI, OGG, TS or MPEG, upright and with increasing times"
 KEY_FRAMES = 30  # frames from one to the next, at most
 QUALITY = {"preset": "veryfast", "crf": "20", "tune": "zerolatency"}  # without frames that are shown later
 
@@ -47,106 +47,59 @@ def length_of(file: Path) -> int | None:
 
 
 def shots_in(file: Path, stride: int = 1) -> Iterator[Shot]:
-    """Every `stride`-th frame of a video; one is held at a time.
+    """Every `stride`-th frame of a video, from its first key frame on; one is held at a time.
 
     Raises DatasetError, after the frames before, if the file is no whole video of upright frames of one size with
     increasing times, or has no frame.
     """
-    number, before, longest = 0, -np.inf, 0.0
+    number, before, longest, is_begun = 0, -np.inf, 0.0, False
     with _opened(file) as (container, stream):
-        for frame in _decoded(file, container, stream):
-            _require_alike(f"{file}, frame {number}", frame, stream, before)
-            if number % stride == 0:
-                yield Shot(number, frame.time, frame.to_ndarray(format="rgb24"))
-            longest = max(longest, frame.time - before if number else 0.0)
-            number, before = number + 1, frame.time
-        end = _end_of(stream)
-    if number == 0:
-        raise DatasetError(f"{file}: no frame can be decoded; expected a video with a key frame")
-    if number > 1 and before + 2 * longest < end:  # decoders pass over some broken frames in silence
-        raise DatasetError(f"{file}: ends at {before:g} s of {end:g} s, after {number} frames; copy the file again")
+        for packet in container.demux(stream):
+            is_begun |= packet.is_keyframe
+            if packet.is_corrupt:
+                raise ValueError(f"ends in the middle of a frame, after {number} frames")
+            for frame in packet.decode() if is_begun or not packet.size else ():
+                _require_alike(number, frame, stream, before)
+                if number % stride == 0:
+                    yield Shot(number, frame.time, frame.to_ndarray(format="rgb24"))
+                longest = max(longest, frame.time - before if number else 0.0)
+                number, before = number + 1, frame.time
+        if number == 0:
+            raise ValueError("no frame can be decoded; expected a video with a key frame")
+        # decoders pass over some broken frames in silence; other formats only estimate a duration
+        end = container.duration / 1e6 if "matroska" in container.format.name and container.duration else 0.0
+        if number > 1 and before + 2 * longest < end:
+            raise ValueError(f"ends at {before:g} s of {end:g} s, after {number} frames")
 
 
-def _end_of(stream: Any) -> float:
-    """The time (seconds) at which the last frame ends as a file of MKV or WEBM states it; 0 without one."""
-    clock = re.fullmatch(r"(\d+):(\d+):(\d+(?:\.\d+)?)", stream.metadata.get("DURATION", "").strip("\0 "))
-    return sum(float(part) * unit for part, unit in zip(clock.groups(), (3600, 60, 1), strict=True)) if clock else 0.0
-
-
-def _decoded(file: Path, container: Any, stream: Any) -> Iterator[Any]:
-    """The frames from the first key frame on."""
-    number, is_begun = 0, False
-    for packet in _packets(file, container, stream):
-        is_begun |= packet.is_keyframe
-        if packet.is_corrupt:
-            raise DatasetError(f"{file}: ends in the middle of a frame, after {number} frames; copy the file again")
-        if not is_begun and packet.size:
-            continue
-        with _reading(f"{file}, after {number} frames"):
-            frames = packet.decode()
-        for frame in frames:
-            if frame.is_corrupt:
-                raise DatasetError(f"{file}, frame {number}: is damaged; copy the file again")
-            yield frame
-            number += 1
-
-
-def _packets(file: Path, container: Any, stream: Any) -> Iterator[Any]:
-    packets = container.demux(stream)
-    while True:
-        with _reading(str(file)):
-            packet = next(packets, None)
-        if packet is None:
-            return
-        yield packet
-
-
-def _require_alike(where: str, frame: Any, stream: Any, before: float) -> None:
-    width, height = stream.width, stream.height
-    if (frame.width, frame.height) != (width, height):
-        raise DatasetError(
-            f"{where}: got {frame.width} x {frame.height} pixels; expected {width} x {height} as in the first frame; "
-            "cut the video there"
-        )
-    if frame.rotation:
-        raise DatasetError(
-            f"{where}: is turned by {abs(frame.rotation)} degrees; encode it upright (`ffmpeg -i FILE OTHER`), "
-            "and let the camera and the boxes refer to the result"
-        )
-    if frame.time is None or not frame.time > before:
-        after = "" if frame.time is None else f" after {before:g} s"
-        got = "no time" if frame.time is None else f"time {frame.time:g} s"
-        raise DatasetError(f"{where}: got {got}{after}; expected increasing times; encode the video again")
+def _require_alike(number: int, frame: Any, stream: Any, before: float) -> None:
+    """Raise ValueError for a frame that is damaged, turned, of another size than the first, or not later."""
+    size, first = (frame.width, frame.height), (stream.width, stream.height)
+    faults = {
+        "is damaged": frame.is_corrupt,
+        f"has {size} pixels; expected {first} as the first": size != first,
+        f"is turned by {abs(frame.rotation)} degrees; turn it for good (`ffmpeg -i FILE OTHER`)": frame.rotation,
+        f"has the time {frame.time} s after {before:g} s": frame.time is None or not frame.time > before,
+    }
+    for fault in (fault for fault, is_there in faults.items() if is_there):
+        raise ValueError(f"frame {number}: {fault}")
 
 
 @contextmanager
 def _opened(file: Path) -> Iterator[tuple[Any, Any]]:
-    """The container and its first stream of images."""
+    """The container and its first stream of images; errors in the body are those of the file."""
     import av
 
-    with _reading(str(file)):
+    with reading(file, WHOLE, what="cannot be read as a video"):
         require_plain(file)
         reads = {"format_whitelist": CONTAINERS, "protocol_whitelist": "file"}
-        container = av.open(f"file:{file}", options=reads, timeout=LONGEST_WAIT)
-    with container:
-        if not container.streams.video:
-            raise DatasetError(f"{file}: has no images; expected a video")
-        stream = container.streams.video[0]
-        stream.thread_type = "AUTO"
-        stream.codec_context.options = {"err_detect": "explode"}  # refuse broken frames instead of guessing them
-        yield container, stream
-
-
-@contextmanager
-def _reading(where: str) -> Iterator[None]:
-    """Turn the errors of files and decoders into a DatasetError."""
-    from av.error import FFmpegError
-
-    try:
-        yield
-    except (OSError, FFmpegError) as error:
-        reason = f"{where}: cannot be read as a video ({gist(error)})"
-        raise DatasetError(f"{reason}; expected a whole file of MP4, MOV, MKV, WEBM, AVI, OGG, TS or MPEG") from None
+        with av.open(f"file:{file}", options=reads, timeout=LONGEST_WAIT) as container:
+            if not container.streams.video:
+                raise ValueError("has no images")
+            stream = container.streams.video[0]
+            stream.thread_type = "AUTO"
+            stream.codec_context.options = {"err_detect": "explode"}  # refuse broken frames instead of guessing them
+            yield container, stream
 
 
 class VideoWriter:

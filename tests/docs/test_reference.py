@@ -19,7 +19,8 @@ from phd_exp.records.cameras import COEFFICIENTS
 from phd_exp.records.foreign import COCO_FILES
 from phd_exp.records.images import FORMATS
 from tests.docs.pages import DOCS, PAGES, REFERENCE, ROOT, module, name
-from tests.records.test_cameras import SAME
+from tests.records.test_cameras import FORMATS as WRITTEN
+from tests.records.test_cameras import WITHOUT
 
 PRIVATE = {"cli"}
 """Packages that only this programme imports."""
@@ -114,7 +115,9 @@ def _source(dotted: str) -> str:
     return Path(str(importlib.import_module(_module(dotted)[0]).__file__)).read_text()
 
 
-TOOLS = {re.sub(r"^JSON of |,.*| \d$", "", name) for name in SAME}  # which the tests of camera files read
+TOOLS = {
+    re.sub(r"^JSON of |,.*| \d$", "", name) for name in WRITTEN | WITHOUT
+}  # which the tests of camera files read
 
 
 @pytest.mark.parametrize(

@@ -139,7 +139,7 @@ def test_what_cannot_be_packed_or_recorded(phd_exp: Callable, run: RunFolder, ph
     calibrate = phd_exp("calibrate", f"run={file}", f"folder={photos}")
     assert calibrate.error.startswith(f"run={file}: a packed run records nothing")
     eight = phd_exp("predict", f"run={file}", f"folder={photos}", "views=8", "recalibrate=true")
-    assert eight.error.startswith(f"{file}/eight_views_held_out.parquet: missing; ")
+    assert "/run.zip/eight_views_held_out.parquet: missing; " in eight.error
     assert phd_exp("pack", f"run={run.path}", "license=a b").error.startswith("license: got 'a b'; ")
     status_of(run, state="interrupted")
     assert phd_exp("pack", f"run={run.path}").error == f"{run.path}: expected the folder of a finished run"

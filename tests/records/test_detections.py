@@ -13,8 +13,8 @@ from phd_exp.records.detections import Detection, detections_of
 from phd_exp.records.errors import DatasetError, UserError
 from phd_exp.records.own_images import DetectionFolder, fingerprint
 
-GOOD: dict[str, Any] = {"file_name": "a.png", "f": 900.0, "x": 0.1, "y": -0.2, "z": 4.0}
 PLACED = {"x": 0.1, "y": -0.2, "z": 4.0}
+GOOD: dict[str, Any] = {"file_name": "a.png", "f": 900.0} | PLACED
 
 
 @pytest.fixture
@@ -40,59 +40,45 @@ def test_a_name_that_is_not_utf8_is_written_in_text() -> None:
     assert detection.line.file_name == "b\\xff.png"
 
 
-def test_what_is_left_out_follows_from_the_image(read: Callable) -> None:
-    (detection,) = read(GOOD)
-    assert detection.focal_lengths_and_centre(640, 481) == (900, 900, 320, 240.5)
-    assert detection.box(640, 481) == (0, 0, 640, 481)
-    assert detection.position == (0.1, -0.2, 4)
-
-
-def test_what_is_said_stands(read: Callable, folder: DetectionFolder) -> None:
-    (detection,) = read(
-        {"file_name": "b/c.jpg", "fx": 800, "fy": 810.5, "cx": 0, "cy": -3.5, "box": [1, 2, 3.5, 4]} | PLACED
-    )
-    assert detection.focal_lengths_and_centre(640, 480) == (800, 810.5, 0, -3.5)
-    assert detection.box(640, 480) == (1, 2, 3.5, 4)
-    assert detection.file == folder.root / "train" / "b" / "c.jpg"
+def test_what_is_said_stands_and_what_is_left_out_follows_from_the_image(
+    read: Callable, folder: DetectionFolder
+) -> None:
+    camera = {"fx": 800, "fy": 810.5, "cx": 0, "cy": -3.5, "box": [1, 2, 3.5, 4]}
+    plain, full = read(GOOD, {"file_name": "b/c.jpg"} | camera | PLACED)
+    assert plain.focal_lengths_and_centre(640, 481) == (900, 900, 320, 240.5)
+    assert (plain.box(640, 481), plain.position) == ((0, 0, 640, 481), (0.1, -0.2, 4))
+    assert full.focal_lengths_and_centre(640, 480) == (800, 810.5, 0, -3.5)
+    assert (full.box(640, 480), full.file) == ((1, 2, 3.5, 4), folder.root / "train" / "b" / "c.jpg")
 
 
 def test_the_lines_of_a_rendered_data_set_are_detections(dataset: DatasetFolder) -> None:
-    records = dataset.records("train")
+    expected = [((one.x, one.y, one.z), one.f, one.scale) for one in dataset.records("train")]
     detections = DetectionFolder(dataset.root).detections("train")
-    assert [detection.position for detection in detections] == [(r.x, r.y, r.z) for r in records]
-    assert [detection.line.f for detection in detections] == [record.f for record in records]
-    assert [detection.line.scale for detection in detections] == [record.scale for record in records]
+    assert [(one.position, one.line.f, one.line.scale) for one in detections] == expected
 
 
+NO_F = {"file_name": "a.png"} | PLACED
 BAD: list[tuple[Any, str]] = [
     ({"f": 900}, "file_name: missing"),
     (GOOD | {"fx": 900, "fy": 900}, "expected either f, or fx and fy"),
-    (PLACED | {"file_name": "a.png", "fx": 900}, "fx is given alone; expected all of fx, fy"),
-    (GOOD | {"camera": "c.yaml"}, "or camera (a file) alone"),
-    (PLACED | {"file_name": "a.png", "camera": "c.yaml", "cx": 3, "cy": 4}, "or camera (a file) alone"),
-    (PLACED | {"file_name": "a.png", "camera": "../c.yaml"}, "camera='../c.yaml' leaves"),
-    (GOOD | {"cx": 10}, "cx is given alone; expected all of cx, cy"),
-    ({"file_name": "a.png", "f": 900, "x": 1, "z": 3}, "x, z is given alone; expected all of x, y, z"),
+    (NO_F | {"fx": 900}, "fx is given alone; expected all of fx, fy"),
+    (NO_F | {"camera": "c.yaml", "cx": 3, "cy": 4}, "or camera (a file) alone"),
+    (NO_F | {"camera": "../c.yaml"}, "camera='../c.yaml' is no file name (leaves"),
     (GOOD | {"z": 0}, "z: got 0; expected to be greater than 0"),
     (
         GOOD | {"x": 0, "y": 0, "z": 0.00085},
-        "got a position 0.00085 m from the camera; expected metres, and at least 0.005",
+        "got a position 0.00085 m from the camera; expected metres, and at least",
     ),
-    (GOOD | {"f": 0}, "f: got 0; expected to be greater than 0"),
     (GOOD | {"f": True}, "f: got True; expected a valid number"),
     (GOOD | {"box": [3, 0, 3, 5]}, "expected [left, top, right, bottom] of positive size"),
     (GOOD | {"box": [0, 9, 3]}, "box.3: missing"),
     (GOOD | {"bx": [0, 0, 3, 5]}, "bx: unknown key, did you mean 'box'?"),
-    (GOOD | {"filename": "a.png"}, "filename: unknown key, did you mean 'file_name'?"),
     (GOOD | {"k1": 0.1}, "k1: a line describes no lens; expected camera, a calibration file"),
     ("[1, 2]", "expected"),
     (GOOD | {"file_name": "b/../../a.png"}, "leaves"),
     (GOOD | {"file_name": "/etc/passwd"}, "leaves"),
     (GOOD | {"file_name": ""}, "file_name: got ''"),
-    (GOOD | {"cx": 1e300, "cy": 0}, "cx: got 1e+300"),
-    (GOOD | {"z": 1e300}, "z: got 1e+300"),
-    (GOOD | {"box": "all"}, "box: got 'all'; expected a valid tuple"),
-    (GOOD | {"box": [0, 0, 1e300, 9]}, "box.2: got 1e+300"),
+    *((GOOD | {"cy": 0, key: 1e300}, f"{key}: got 1e+300") for key in ("cx", "z")),
 ]
 
 
@@ -114,35 +100,27 @@ def test_no_link_leaves_the_folder(read: Callable, folder: DetectionFolder, tmp_
     os.symlink("inside.png", folder.root / "train" / "in.png")
     os.symlink(tmp_path, folder.root / "train" / "up")
     assert len(read(GOOD | {"file_name": "in.png"})) == 1
+    os.symlink(folder.root, tmp_path / "link")
+    assert len(DetectionFolder(tmp_path / "link").detections("train")) == 1
     for name in ("out.png", "up/secret.png"):
         with pytest.raises(DatasetError, match="leaves"):
             read(GOOD | {"file_name": name})
 
 
-def test_a_linked_folder_is_no_way_out(folder: DetectionFolder, read: Callable, tmp_path: Path) -> None:
-    read(GOOD)
-    os.symlink(folder.root, tmp_path / "link")
-    assert len(DetectionFolder(tmp_path / "link").detections("train")) == 1
-
-
 def test_a_box_may_reach_beyond_the_image_but_not_without_end_nor_lie_beside_it(read: Callable) -> None:
     beside = [(640, 0, 700, 10), (-9, 0, 0, 10), (0, 480, 5, 500), (0, -7, 5, 0)]
-    boxes = [(-600, -100, 1200, 500), (-600, -100, 1400, 500), *beside]
-    inside, huge, *outside = read(*(GOOD | {"box": box} for box in boxes))
+    boxes = [(-600, -100, 1200, 500), (-600, -100, 1400, 500), *beside, (0.1, 0.1, 0.4, 0.5), (0.9, 0.9, 1.4, 1.3)]
+    inside, *refused = read(*(GOOD | {"box": box} for box in boxes))
     assert inside.box(640, 480) == (-600, -100, 1200, 500)
-    with pytest.raises(DatasetError, match=r"line 2: box=.* more than 3 times as large"):
-        huge.box(640, 480)
-    for detection in outside:
-        with pytest.raises(DatasetError, match=r"line \d: box=.* lies outside the image of 640 x 480 pixels"):
+    reasons = ["more than 3 times as large", *["lies outside the image"] * 4, *["in units of the image"] * 2]
+    for detection, reason in zip(refused, reasons, strict=True):
+        with pytest.raises(DatasetError, match=rf"line \d: box=.* {reason}.* 640 x 480 pixels"):
             detection.box(640, 480)
 
 
-def test_blank_lines_count_and_a_number_takes_the_first(read: Callable) -> None:
+def test_blank_lines_count_and_a_number_takes_the_first(read: Callable, folder: DetectionFolder) -> None:
     detections = read(GOOD, "", "  ", GOOD, "not read at all", n=2)
     assert [detection.where[-6:] for detection in detections] == ["line 1", "line 4"]
-
-
-def test_too_few_none_and_no_file_at_all(read: Callable, folder: DetectionFolder) -> None:
     with pytest.raises(DatasetError, match=r"3 detections asked for \(data.n_train\), 2 found"):
         read(GOOD, GOOD, n=3)
     with pytest.raises(DatasetError, match=r"metadata\.jsonl: some detections asked for .*, 0 found"):
@@ -151,19 +129,15 @@ def test_too_few_none_and_no_file_at_all(read: Callable, folder: DetectionFolder
         folder.detections("test")
 
 
-def test_the_fingerprint_is_of_both_splits(read: Callable, folder: DetectionFolder) -> None:
-    (folder.root / "test").mkdir()
-    (folder.root / "test/metadata.jsonl").write_text("")
-    seen, folders = set(), [folder.root / "train", folder.root / "test"]
-    for split in ("train", "test"):
-        read(GOOD)
-        for f in (901.0, 902.0):
-            (folder.root / split / "metadata.jsonl").write_text(json.dumps(GOOD | {"f": f}) + "\n")  # type: ignore[arg-type]
-            seen.add(fingerprint(*folders))
-    assert len(seen) == 4
-    camera = folder.root / "test" / "camera.yaml"
-    (folder.root / "test/metadata.jsonl").write_text('{"file_name": "a.png", "camera": "camera.yaml"}\n')
-    for text in ("K: 1", "K: 2"):
-        camera.write_text(text)
-        seen.add(fingerprint(*folders))
-    assert len(seen) == 6, "of the camera files too"
+def test_the_fingerprint_is_of_both_splits_and_of_camera_files(read: Callable, folder: DetectionFolder) -> None:
+    read(GOOD)
+    folders = [folder.root / "train", folder.root / "test"]
+    folders[1].mkdir()
+    (folders[1] / "metadata.jsonl").write_text('{"file_name": "a.png", "camera": "camera.yaml"}\n')
+    (folders[1] / "camera.yaml").touch()
+    seen = [fingerprint(*folders)]
+    for name in ("train/metadata.jsonl", "test/metadata.jsonl", "test/camera.yaml"):
+        with open(folder.root / name, "a") as stream:
+            stream.write("\n")
+        seen.append(fingerprint(*folders))
+    assert len(set(seen)) == 4

@@ -11,7 +11,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from phd_exp.records.dataset import SPLITS
-from phd_exp.records.detections import Detection, detections_of
+from phd_exp.records.detections import Detection
 from phd_exp.records.errors import DatasetError, UserError
 from phd_exp.records.foreign import boxes_in
 from phd_exp.records.own_images import annotations, detections_in, fingerprint, observed
@@ -122,13 +122,6 @@ def test_the_size_of_an_image_is_that_of_its_annotations(read: Callable, width: 
         spoon.focal_lengths_and_centre(width, height)
 
 
-@pytest.mark.parametrize("box", [[0.1, 0.1, 0.4, 0.5], [0, 0, 1, 1], [0.9, 0.9, 1.4, 1.3]])
-def test_a_box_in_units_of_the_image_is_refused(box: list[float]) -> None:
-    (detection,) = detections_of([Path("a.png")], {"f": 100.0, "box": box})
-    with pytest.raises(DatasetError, match=r"a\.png: box=.* in units of the image; expected pixels"):
-        detection.box(120, 90)
-
-
 @pytest.mark.parametrize(("sensor", "images"), [("cam1", "rgb_cam1"), ("gray2", "gray2"), ("xyz", "gray_xyz")])
 def test_bop_of_several_sensors_is_read_as_each_of_them(tmp_path: Path, sensor: str, images: str) -> None:
     scene = WRITERS["bop"](tmp_path / "test") / "000002"
@@ -233,7 +226,7 @@ def test_results_are_the_boxes_of_one_image(tmp_path: Path) -> None:
         ((), None, "no box to predict: it is empty"),
         ((one, {"image_id": 3}), None, "box 1: cannot be read ..bbox. is missing"),
         ((one, one | {"bbox": [1, 2, 3]}), None, "box 1: cannot be read .not enough values"),
-        ((1,), None, "cannot be read .expected a list of .bbox: .x, y, width, height."),
+        ((1,), None, "box 0: cannot be read .* expected .*bbox: .x, y, width, height."),
         ((one, one | {"bbox": ["1", "2", "three", "4"]}), None, "box 1: cannot be read .could not convert"),
     ]:
         with pytest.raises(DatasetError, match=line):
@@ -296,22 +289,22 @@ BAD = [
     (bop(GT, lambda gt: gt["3"][0].pop("cam_t_m2c")), "image 3, object 0: cannot be read .'cam_t_m2c' is missing"),
     (bop(GT, lambda gt: gt["3"][0].update(cam_t_m2c=[0, 0, -900])), r"image 3, object 0: z: got -0\.9"),
     (bop(GT, lambda gt: gt.update({"3": 1})), "cannot be read"),
-    (bop(CAMERA, lambda camera: camera.pop("3")), r"scene_camera\.json, image 3: cannot be read .3 is missing"),
+    (bop(CAMERA, lambda camera: camera.pop("3")), "000002, image 3: cannot be read .3 is missing"),
     (bop(INFO, lambda info: info["3"][0].update(visib_fract=2)), "visibility: got 2"),
-    (bop(INFO, lambda info: info.pop("3")), r"scene_gt_info\.json, image 3: cannot be read .3 is missing"),
+    (bop(INFO, lambda info: info.pop("3")), "000002, image 3: cannot be read .3 is missing"),
     (bop(INFO, lambda info: info["3"].pop()), "000002, image 3: cannot be read .zip.. argument 2 is shorter"),
     (("bop", lambda folder: (folder / "000002" / INFO).unlink()), "expected scene_gt_info.json, which bop_toolkit"),
     (bop(CAMERA, lambda camera: camera["3"].update(cam_K=SKEW)), "camera without skew"),
     (bop(CAMERA, lambda camera: camera["3"].update(cam_R_w2c=[1, 0, 0, 0, 1, 0, 0, 0.1, 1])), "a rotation matrix"),
     (bop(CAMERA, lambda camera: camera["3"].update(cam_R_w2c=[np.nan, *TURN[1:]])), "a rotation matrix"),
-    (("bop", lambda folder: (folder / "000002/rgb/000003.jpg").unlink()), "rgb, image 000003: .*'000003' is missing"),
+    (("bop", lambda folder: (folder / "000002/rgb/000003.jpg").unlink()), "image 3: .*'000003' is missing"),
     (("coco", lambda folder: (folder.parent / "annotations/instances_test.json").write_text("[]")), "an object"),
     (coco(lambda content: content.pop("images")), "'images' is missing"),
     (coco(lambda content: content.pop("camera")), r"annotation 1: .*no camera; add \"camera\""),
     (coco(lambda content: content["camera"].update(k1=0.1)), "annotation 1: k1: a line describes no lens"),
     (coco(lambda content: content["annotations"][0].update(bbox=[1, 2, 0, 3])), "annotation 0: box=.* positive size"),
     (coco(lambda content: content["images"][1].update(id="7")), "the id 7 is given twice"),
-    (coco(lambda content: content["images"][1].update(file_name="../b.png")), "file_name='../b.png' leaves"),
+    (coco(lambda content: content["images"][1].update(file_name="../b.png")), "is no file name .leaves"),
 ]  # fmt: skip
 
 

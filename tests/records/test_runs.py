@@ -75,8 +75,8 @@ def test_an_unwritable_run_folder_is_one_line(tmp_path: Path) -> None:
     [
         *(("status", content, r"status\.json: not a run status .*delete the folder") for content in NO_STATUS),
         ("results", "{", "results.json: cannot be read"),
-        ("results", "[1]", "results.json: expected a mapping, found list"),
-        ("results", None, r"results\.json: missing"),
+        ("results", "[1]", "results.json: cannot be read .a list; expected a mapping"),
+        ("results", None, r"results\.json: cannot be read .No such file"),
     ],
 )
 def test_a_broken_record_is_named(folder: RunFolder, read: str, content: str | None, said: str) -> None:

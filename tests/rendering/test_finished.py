@@ -110,7 +110,8 @@ def test_a_change_with_fitting_checksums_shows_when_rendered_again(
 
 
 @pytest.mark.parametrize(
-    ("content", "said"), [(b"GIF89a", "cannot be decoded"), (png(8), "8 x 8 pixels, 56 x 56 recorded")]
+    ("content", "said"),
+    [(b"GIF89a", "cannot be read as an image"), (png(8), "(8, 8) pixels of RGB; expected 56 x 56")],
 )
 def test_an_image_of_another_kind_is_named(
     copy: DatasetFolder, small_spec: DatasetSpec, content: bytes, said: str
