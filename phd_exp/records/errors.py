@@ -77,8 +77,8 @@ def reading(
 ) -> Iterator[None]:
     """Convert any error in the body, which reads a file of others, to a UserError of a `kind`, one line.
 
-    The line has the place, the reason, and a remedy: `otherwise`, but READABLE if the system refuses to read the file.
-    A UserError passes unchanged. Parsers raise errors of many kinds on damaged files, hence `Exception`.
+    The line has the place, the reason, and a remedy: `otherwise`, but READABLE if the system refuses to read. A
+    UserError passes unchanged. Parsers raise errors of many kinds on damaged files, hence `Exception`.
     """
     try:
         yield

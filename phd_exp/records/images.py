@@ -34,7 +34,7 @@ def pillow_warnings() -> Iterator[None]:
 
 @contextmanager
 def decoding(file: Path) -> Iterator[None]:
-    """Convert the errors of decoding an image, which Pillow limits in pixels, to a DatasetError that names the file."""
+    """Convert the errors of decoding an image, whose pixels Pillow limits, to a DatasetError that names the file."""
     with reading(file, f"expected a whole image ({', '.join(FORMATS)})", what="cannot be read as an image"):
         try:
             yield

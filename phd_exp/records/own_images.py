@@ -145,9 +145,9 @@ def observed(detections: Sequence[Detection]) -> list[Observed]:
         scene, pose = detection.line.scene, detection.line.pose
         if scene is None or pose is None:
             raise DatasetError(
-                f"{detection.where}: scene or pose is missing; expected on all lines that show the same object at the "
-                "same time the same scene, a number or name, and the pose of the camera: the rotation [w, x, y, z] "
-                "and translation of R v + t from the world to the camera"
+                f"{detection.where}: scene or pose is missing; expected the same scene, a number or name, on all "
+                "lines that show the same object at the same time, and the pose of the camera: the rotation "
+                "[w, x, y, z] and translation of R v + t from the world to the camera"
             )
         views.setdefault(scene, []).append((detection, pose))
     return [Observed(scene, *map(tuple, zip(*pairs, strict=True))) for scene, pairs in views.items()]

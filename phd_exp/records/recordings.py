@@ -32,8 +32,8 @@ ENCODINGS = {
 }
 """Encoding of an image that is not compressed -> bytes a pixel, and the places of its colours; 8UC3 as in OpenCV."""
 DAMAGED = (
-    "copy the file again; if its writer was interrupted, `mcap recover` or `ros2 bag reindex` repairs it; bags of ROS "
-    "1 need `rosbags-convert`"
+    "copy the file again; if its writer was interrupted, `mcap recover` or `ros2 bag reindex` repairs it; bags of "
+    "ROS 1 need `rosbags-convert`"
 )
 RECTIFIED = "image_rect"
 """Beginning of the names of topics whose images have no distortion, and the camera P instead of K."""
