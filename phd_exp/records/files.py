@@ -1,4 +1,4 @@
-"""Files that are whole or absent: atomic writing, and journals that survive a kill."""
+"""Files that are whole or absent, and lines of which a killed writer tears the last one at most."""
 
 import errno
 import fcntl
@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable
 from contextlib import suppress
 from itertools import count
 from pathlib import Path
-from typing import TextIO, TypeVar
+from typing import TypeVar
 
 from phd_exp.records.errors import CorruptFileError, reading
 from phd_exp.records.parsing import parse_json
@@ -120,22 +120,6 @@ def remove_temporaries(folder: Path) -> None:
                     shutil.rmtree(path) if path.is_dir() else path.unlink()
                 finally:
                     os.close(descriptor)
-
-
-def open_journal(path: Path) -> TextIO:
-    """Open an append-only file of lines, each of which is passed to the system at once.
-
-    An incomplete last line, left by a killed writer, is removed first; the next line would otherwise continue it.
-
-    Raises OSError if the file cannot be created, read or written.
-    """
-    with open(path, "a+b") as stream:
-        stream.seek(0)
-        whole = stream.read()
-        complete = whole.rfind(b"\n") + 1
-        if complete < len(whole):
-            stream.truncate(complete)
-    return open(path, "a", encoding="utf-8", buffering=1)
 
 
 def read_jsonl(

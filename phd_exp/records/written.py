@@ -3,13 +3,14 @@
 import errno
 import hashlib
 import json
+from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
 from phd_exp.records.errors import CorruptFileError
-from phd_exp.records.files import checksum, make_folder, open_journal, read_jsonl, write_atomic
+from phd_exp.records.files import checksum, make_folder, read_jsonl, write_atomic
 from phd_exp.records.processes import announce
 
 
@@ -78,8 +79,13 @@ class Written:
 
     def __enter__(self) -> Self:
         make_folder(self.folder)
-        self._journal = open_journal(self._list)
+        # anew, without the last line that a killed command left incomplete
+        self._store((name, digest) for name, each in self._listed().items() for digest in each)
+        self._journal = open(self._list, "a", encoding="utf-8", buffering=1)  # a line is on disk once it is written
         return self
+
+    def _store(self, entries: Iterable[tuple[str, str | None]]) -> None:
+        write_atomic(self._list, "".join(json.dumps(entry) + "\n" for entry in entries))
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, place: TracebackType | None
@@ -92,10 +98,10 @@ class Written:
         removed = [name for name in self._earlier.keys() - self._now.keys() if self._remove(name)]
         others = ((name, one) for name, each in self._listed().items() for one in each if name not in self._earlier)
         entries = dict(others) | self._now  # others: of a command at the same time
-        write_atomic(self._list, "".join(json.dumps(entry) + "\n" for entry in entries.items()))
-        if removed or self._earlier.keys() & self._now.keys():
-            replaced = len(self._earlier.keys() & self._now.keys())
-            announce(f"{self.folder}: of an earlier command, {replaced} files replaced, {len(removed)} removed")
+        self._store(entries.items())
+        replaced = self._earlier.keys() & self._now.keys()
+        if removed or replaced:
+            announce(f"{self.folder}: of an earlier command, {len(replaced)} files replaced, {len(removed)} removed")
 
     def _remove(self, name: str) -> bool:
         """Remove a file of an earlier command, unless others changed it or a link leads out of the folder."""
