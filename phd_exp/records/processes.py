@@ -22,8 +22,8 @@ PATIENCE = 10.0  # seconds that a child gets to finish its work before it is kil
 
 
 @contextmanager
-def held(path: Path, *, shared: bool = False, waiting: str | None = None) -> Iterator[bool]:
-    """Hold a lock in the body, exclusively or `shared` with other shared holders; yields whether it is held.
+def held(path: Path, *, waiting: str | None = None) -> Iterator[bool]:
+    """Hold a lock in the body; yields whether it is held.
 
     If the lock is taken, `waiting` is printed and the lock awaited; without `waiting`, False is yielded at once.
 
@@ -40,21 +40,17 @@ def held(path: Path, *, shared: bool = False, waiting: str | None = None) -> Ite
         ...         print(first, second)
         True False
     """
-    kind = fcntl.LOCK_SH if shared else fcntl.LOCK_EX
-    # NFS requires read access for a shared lock and write access for an exclusive one
-    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
-    try:
+    # NFS requires write access
+    with open(os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666), "rb") as stream:
         free = True
         try:
-            fcntl.flock(descriptor, kind | fcntl.LOCK_NB)
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             free = waiting is not None
             if waiting is not None:
                 announce(waiting)
-                fcntl.flock(descriptor, kind)
+                fcntl.flock(stream, fcntl.LOCK_EX)
         yield free
-    finally:
-        os.close(descriptor)
 
 
 class Child:

@@ -3,8 +3,11 @@
 import json
 import math
 from pathlib import Path
+from typing import Any
 
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from phd_exp.records.choices import RunName
 from phd_exp.records.errors import RunError
@@ -48,10 +51,8 @@ def test_a_run_that_is_stopped_says_so(folder: RunFolder, stop: BaseException, s
     with pytest.raises(type(stop)), folder.recording(data_manifest=None):
         raise stop
     status = folder.status()
-    assert status.state == state
-    assert not folder.is_finished()
-    if state == "failed":
-        assert "test_runs.py" in status.traceback
+    assert (status.state, folder.state()[0], folder.is_finished()) == (state, state, False)
+    assert state != "failed" or "test_runs.py" in status.traceback
 
 
 def test_two_processes_cannot_hold_one_run(folder: RunFolder) -> None:
@@ -86,13 +87,28 @@ def test_a_broken_record_is_named(folder: RunFolder, read: str, content: str | N
         getattr(folder, read)()
 
 
-def test_config_and_results_come_back(folder: RunFolder) -> None:
-    folder.write_config({"seed": 0, "data": {"n_train": 3}})
-    folder.write_results({"test/nll": -1.5, "test/calibration/depth_ence": math.nan, "epochs": 3})
-    assert folder.config() == {"seed": 0, "data": {"n_train": 3}}
-    written = {"test/nll": -1.5, "test/calibration/depth_ence": None, "epochs": 3}
-    assert folder.results() == json.loads(folder.results_file.read_text()) == written
-    assert "NaN" not in folder.results_file.read_text(), "JSON knows no such number"
+keys, leaves = st.text("abc/._", min_size=1), st.none() | st.booleans() | st.integers() | st.text() | st.floats()
+configs = st.dictionaries(keys, st.recursive(leaves, lambda inner: st.lists(inner) | st.dictionaries(keys, inner)))
+numbers = st.dictionaries(keys, st.none() | st.integers(-(10**9), 10**9) | st.floats())
+
+
+def finite(row: dict[str, Any]) -> dict[str, Any]:
+    """JSON has no other numbers."""
+    return {
+        key: None if isinstance(value, float) and not math.isfinite(value) else value for key, value in row.items()
+    }
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@given(config=configs, row=numbers)
+def test_what_is_recorded_comes_back(folder: RunFolder, config: dict[str, Any], row: dict[str, Any]) -> None:
+    folder.write_config(config)
+    assert repr(folder.config()) == repr(config)
+    folder.write_results(row)
+    assert folder.results() == json.loads(folder.results_file.read_text()) == finite(row)
+    rows = [{"epoch": epoch, **finite(row)} for epoch in (-1, 0, 1)]
+    folder.write_metrics(rows)
+    assert folder.metrics() == rows
 
 
 def test_finds_all_runs(tmp_path: Path) -> None:
