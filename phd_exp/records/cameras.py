@@ -41,7 +41,7 @@ NAMES = {
     "height": "imageheight height h",
     "size": "resolution imagesize cameraresolution size",
     "K": "k cameramatrix camk mtx intrinsics matrix",
-    **{"flx": "flx", "fly": "fly", "fx": "fx", "fy": "fy", "cx": "cx", "cy": "cy"},
+    **{"fx": "fx flx", "fy": "fy fly", "cx": "cx", "cy": "cy"},
     "D": "d dist distcoeff distcoeffs distortion distortions distortioncoeffs distortioncoefficients",
     "model": "distortionmodel cameramodel",
     "fisheye": "fisheyemodel isfisheye fisheye",
@@ -128,14 +128,18 @@ class _Region(BaseModel):
 
 
 class _Described(BaseModel):
-    """A camera as its file describes it, by the quantities of `NAMES`; `named` are coefficients with names."""
+    """A camera as its file describes it, by the quantities of `NAMES`.
+
+    Attributes:
+        corner: where its tool's pixel (0, 0) lies in this package's camera files, px.
+        named: coefficients with names.
+    """
 
     width: Side = None
     height: Side = None
     size: Annotated[tuple[Size, Size], BeforeValidator(_flat)] | None = None
     K: Numbers = []
-    flx: Number | None = None
-    fly: Number | None = None
+    corner: float = 0.0
     fx: Number | None = None
     fy: Number | None = None
     cx: Number | None = None
@@ -150,15 +154,13 @@ class _Described(BaseModel):
 
     @property
     def matrix(self) -> list[float]:
-        """K by rows. COLMAP and nerfstudio, which name the focal length fl_x, count pixels from the corner."""
-        corner = 0.0 if self.flx is None else CORNER
-        single = [self.fx, self.fy] if self.flx is None else [self.flx, self.fly]
-        fx, fy, cx, cy = self.K if len(self.K) == 4 else [*single, self.cx, self.cy]
+        """K by rows."""
+        fx, fy, cx, cy = self.K if len(self.K) == 4 else (self.fx, self.fy, self.cx, self.cy)
         if fx is None:
             return self.K
         if fy is None or cx is None or cy is None:
             raise ValueError("fx, fy, cx, cy: one is missing; expected all of them")
-        rows = [fx, 0.0, cx - corner, 0.0, fy, cy - corner, 0.0, 0.0, 1.0]
+        rows = [fx, 0.0, cx - self.corner, 0.0, fy, cy - self.corner, 0.0, 0.0, 1.0]
         if len(self.K) == 9 and rows != self.K:
             raise ValueError(f"K: differs from fx, fy, cx, cy; {ONE_CAMERA}")
         return rows
@@ -224,9 +226,11 @@ def _described(content: Any) -> _Described:
             given, value = value, _MODELS.get(_plain(value))
             if value is None:
                 raise ValueError(f"{key}: got {shown(given)}; expected {', '.join(COEFFICIENTS)}, or another name")
+        if name == "fx" and "fl" in key.lower():  # COLMAP and nerfstudio, which count pixels from the corner
+            found["corner"] = CORNER
         if name and value != "" and found.setdefault(name, value) != value:
             raise ValueError(f"{key}: has two values; {ONE_CAMERA}")
-    if not {"K", "fx", "flx"} & found.keys():
+    if not {"K", "fx"} & found.keys():
         raise ValueError(f"no camera matrix: found {listed([*dict(values)]) or 'no keys'}; expected {READ}")
     named = {name: found[name] for name in COEFFICIENTS["rational_polynomial"] if name in found}
     return _Described(**{name: found[name] for name in found.keys() & _Described.model_fields}, named=named)

@@ -102,12 +102,6 @@ class Child:
             raise message
         return message
 
-    def was_killed(self) -> bool:
-        """Whether a signal has ended the process, or does so within a second."""
-        with suppress(subprocess.TimeoutExpired):
-            return self.process.wait(1.0) < 0
-        return False
-
     def _end(self) -> str:
         try:
             code = self.process.wait(PATIENCE)

@@ -80,17 +80,6 @@ def opencv(camera: Camera, more: str = "", names: str = "camera_matrix distortio
     )
 
 
-def xml(camera: Camera) -> str:
-    parts = [("camera_matrix", camera.K), ("distortion_coefficients", camera.D)]
-    matrices = "".join(
-        f'<{name} type_id="opencv-matrix">\n  <rows>{len(data)}</rows>\n  <dt>d</dt>\n'
-        f"  <data>\n    {' '.join(map(str, data))}</data></{name}>\n"
-        for name, data in parts
-    )
-    sizes = "<!-- px --><image_width>640</image_width>\n<image_height>480</image_height>\n"
-    return f'<?xml version="1.0"?>\n<opencv_storage>\n{sizes}{matrices}</opencv_storage>\n'
-
-
 def ini(camera: Camera) -> str:
     rows = "\n".join(" ".join(map(str, row)) for row in camera.rows)
     return (
@@ -145,7 +134,6 @@ FORMATS: dict[str, tuple[Callable[[Camera], Any], tuple[str, ...]]] = {
     "OpenCV": (opencv, (BROWN, RATIONAL, KB)),
     "OpenCV 5": (lambda c: opencv(c, nd="nd-").replace(":1.0", " 1.2"), (BROWN,)),
     "OpenCV, K": (lambda c: opencv(c, "distortion_model: radtan\n", "K D"), (FOUR,)),
-    "OpenCV, XML": (xml, (BROWN, RATIONAL)),
     "OpenCV, interactive-calibration": (
         lambda c: opencv(c, "dist_coeffs_std_dev: [0.1, 0.2]\n", "cameraMatrix dist_coeffs"), (BROWN,),
     ),
@@ -203,7 +191,8 @@ def read(file: Path, content: Any, encoding: str = "utf-8") -> Calibration:
 @given(data=st.data())
 def test_a_camera_comes_back(file: Path, name: str, model: str, data: st.DataObject) -> None:
     camera = data.draw(cameras(model))
-    found = read(file, FORMATS[name][0](camera))
+    encoding = data.draw(st.sampled_from(["utf-8", "utf-8-sig"]))
+    found = read(file.with_suffix(data.draw(st.sampled_from([".yaml", ".txt"]))), FORMATS[name][0](camera), encoding)
     assert (found.width, found.height) in ((640, 480), (None, None))
     assert (found.K, found.D, found.model) == (tuple(camera.K), tuple(camera.D), camera.model)
 
@@ -218,12 +207,6 @@ def test_a_camera_without_distortion_comes_back(file: Path, name: str, camera: C
 
 CAMERA = Camera(400.5, 401.2, 319.5, 239.5, BROWN, [-0.28, 0.07, 0.0005, -0.0003, 0.01])
 FISHEYE = CAMERA._replace(model=KB, D=[-0.03, 0.004, -0.002, 0.0003])
-
-
-@pytest.mark.parametrize("name", ["ROS", "OpenCV", "ROS, INI", "OpenCV, XML", "COLMAP"])
-def test_a_mark_of_the_byte_order_and_the_suffix_do_not_matter(file: Path, name: str) -> None:
-    content = FORMATS[name][0](CAMERA)
-    assert read(file.with_suffix(".txt"), content, "utf-8-sig") == read(file, content)
 
 
 def test_pixels_count_from_the_corner_and_the_size_must_be_that_of_the_image(file: Path) -> None:
@@ -252,14 +235,12 @@ def test_a_file_that_opencv_writes_now(file: Path, suffix: str) -> None:
 def test_a_focal_length_in_millimetres_is_refused_unless_the_lens_is_a_fisheye(file: Path) -> None:
     with pytest.raises(DatasetError, match=r"photo\.jpg: .*18 x 18 pixels.* shows 174 degrees; .*f in millimetres"):
         detections_of([Path("photo.jpg")], {"f": 18.0})[0].focal_lengths_and_centre(640, 480)
-    for camera, shown in ((CAMERA, "shows 152 degrees; expected at most 150"), (FISHEYE, None)):
-        read(file, ros(camera._replace(fx=80.0, fy=80.0)))
-        (detection,) = detections_of([Path("photo.jpg")], {"camera": str(file)})
-        if shown is None:
-            assert detection.focal_lengths_and_centre(640, 480)[0] == 80
-        else:
-            with pytest.raises(DatasetError, match=shown):
-                detection.focal_lengths_and_centre(640, 480)
+    wide, fisheye = (ros(camera._replace(fx=80.0, fy=80.0)) for camera in (CAMERA, FISHEYE))
+    read(file, fisheye)
+    assert detections_of([Path("a")], {"camera": str(file)})[0].focal_lengths_and_centre(640, 480)[0] == 80
+    read(file, wide)
+    with pytest.raises(DatasetError, match="shows 152 degrees; expected at most 150"):
+        detections_of([Path("a")], {"camera": str(file)})[0].focal_lengths_and_centre(640, 480)
 
 
 F = dict(zip(("fx", "fy", "cx", "cy"), CAMERA, strict=False))
@@ -267,29 +248,23 @@ TWO = "two values; expected the calibration of one camera alone"
 BAD: list[tuple[Any, str]] = [
     (ros(CAMERA, camera_matrix=None), "no camera matrix: found image_width, image_height, camera_name, distortion_"),
     (ros(CAMERA, distortion_coefficients=None), "D: missing; expected the coefficients of plumb_bob"),
-    (ros(CAMERA, camera_matrix=matrix(CAMERA.K[:6], 2, 3)), "camera matrix: got [400.5"),
     (ros(CAMERA._replace(fx=0.9, fy=0.001)), "expected [fx, 0, cx, 0, fy"),
     (ros(CAMERA._replace(fx=float("nan"))), "K.0: got nan; expected to be a finite number"),
-    (ros(CAMERA, camera_matrix="wide"), "K.0: got 'wide'; expected a valid number"),
     (ros(CAMERA, distortion_model="thin_plate"), "distortion_model: got 'thin_plate'; expected plumb_bob, "),
     (ros(CAMERA, distortion_model=KB), "got [-0.28, 0.07, 0.0005, -0.0003, 0.01]; expected k1, k2, k3, k4 for equi"),
     (ros(CAMERA, [0.1] * 3), "expected k1, k2, p1, p2, k3 for plumb_bob"),
     (ros(CAMERA, image_width=0), "width: got 0; expected to be greater than 0"),
     (ros(CAMERA, xi=1.2), "xi: got 1.2, a part of a lens that is not supported"),
-    (ros(CAMERA, lens={"radial_terms": [0.1]}), "lens.radial_terms: got [0.1], a part of a lens"),
     (ros(CAMERA, roi={"x_offset": "left"}), "roi.x_offset: got 'left'; expected a valid integer"),
     ({"K": CAMERA.K, "D": CAMERA.D[:4]}, "add distortion_model: plumb_bob (k1, k2, p1, p2) or equidistant"),
     (F | {"k1": 0.1}, "1 coefficients of no model; add distortion_model"),
-    ({"fx": 400, "fy": 400}, "fx, fy, cx, cy: one is missing"),
     (F | {"K": FISHEYE._replace(fx=9.0).K}, "K: differs from fx, fy, cx, cy"),
     (plain(CAMERA) | {"k1": 0.1}, "D and k1: are two lenses; expected one"),
     (kalibr(CAMERA) | kalibr(FISHEYE, "cam1"), f"cam1.distortion_coeffs: has {TWO}"),
     (anipose(CAMERA) + anipose(CAMERA._replace(fx=900.0), "cam_1"), f"cam_1.matrix: has {TWO}"),
     ("400 400 320\n", "3 numbers; expected K, 3 x 3, or one line of fx fy cx cy, or with k1 k2 p1 p2; expected ROS"),
-    ("1 FOV 640 480 400 400 320 240 0.9", "FOV with 5 parameters; expected one of SIMPLE_PINHOLE"),
     ("<calibration><f>900</f></calibration>", "XML of <calibration>; expected <opencv_storage>"),
     ('<!DOCTYPE a [<!ENTITY b "c">]><opencv_storage/>', "XML with a document type declaration"),
-    ({"camera_angle_x": 0.7, "frames": []}, "no camera matrix: found camera_angle_x, frames; expected ROS"),
     ("a: [1", "while parsing"),
     ("", "no camera matrix: found no keys"),
     (None, "No such file or directory"),
