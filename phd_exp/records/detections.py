@@ -175,17 +175,14 @@ class Detection:
         if self.line.box is None:
             return 0.0, 0.0, float(width), float(height)
         left, top, right, bottom = self.line.box
-        fault = None
-        if max(right, bottom) <= NORMALISED < max(width, height):
-            fault = "seems to be in units of the image; expected pixels of"
-        elif left >= width or top >= height or right <= 0 or bottom <= 0:
-            fault = "lies outside"
-        elif max(right - left, bottom - top) > LARGEST_BOX * max(width, height):
-            fault = f"is more than {LARGEST_BOX} times as large as"
-        if fault:
-            raise DatasetError(
-                f"{self.where}: box={list(self.line.box)} {fault} the image of {width} x {height} pixels"
-            )
+        larger = max(width, height)
+        faults = {
+            "seems to be in units of the image; expected pixels of": max(right, bottom) <= NORMALISED < larger,
+            "lies outside": left >= width or top >= height or right <= 0 or bottom <= 0,
+            f"is more than {LARGEST_BOX} times as large as": max(right - left, bottom - top) > LARGEST_BOX * larger,
+        }
+        for fault in (fault for fault, is_there in faults.items() if is_there):
+            raise DatasetError(f"{self.where}: box={[*self.line.box]} {fault} the image of {width} x {height} pixels")
         return left, top, right, bottom
 
 

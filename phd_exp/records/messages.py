@@ -10,13 +10,12 @@ Source: REP 103 and 105; the definitions of vision_msgs, geometry_msgs, sensor_m
 import fcntl
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from jaxtyping import Float
@@ -44,16 +43,10 @@ Content = dict[str, Any]
 """The fields of a message, nested."""
 
 
-@dataclass(frozen=True, eq=False)
-class Located:
-    """The position of an object.
+class Located(NamedTuple):
+    """The position of an object: mean (m) and covariance (m²).
 
-    Args:
-        mean: m.
-        covariance: m².
-        class_id: of the detector.
-        score: of the detector; 1 without one.
-        id: the same in messages about the same object.
+    A detector gives `class_id` and `score`. The `id` is the same in messages about the same object.
     """
 
     mean: Float[np.ndarray, "3"]
@@ -63,17 +56,8 @@ class Located:
     id: str = ""
 
 
-@dataclass(frozen=True, eq=False)
-class Photograph:
-    """An image file and its camera.
-
-    Args:
-        format: `png` or `jpeg`.
-        content: the bytes of the file.
-        size: width and height, px.
-        K: camera matrix, px, as `intrinsics` returns it.
-        lens: of the camera.
-    """
+class Photograph(NamedTuple):
+    """The bytes of an image file, its `format` (png or jpeg) and size (px); K (px) and lens of its camera."""
 
     format: str
     content: bytes

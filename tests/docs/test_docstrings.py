@@ -13,12 +13,6 @@ from tests.docs.pages import module
 
 Definition = ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
 FILES = sorted(PACKAGE.rglob("*.py"))
-MAIN = {
-    *("ProjectedHuber", "Temperature", "fuse", "Camera", "DepthScale", "VirtualCamera", "RunName", "RunFolder"),
-    *("MeanAbsoluteError", "ChartHead", "DistributionHead", "Regressor", "resnet"),
-    *("calibration_curve", "coverage", "miscalibration_area"),
-}
-"""Classes and functions that README.md and docs/ use."""
 
 
 def test_every_public_name_has_a_docstring() -> None:
@@ -33,11 +27,6 @@ def test_every_public_name_has_a_docstring() -> None:
 def test_examples_run(capsys: pytest.CaptureFixture[str]) -> None:
     failed = [example.name for file in FILES for example in _examples(file) if _failures(example)]
     assert failed == [], capsys.readouterr().out
-
-
-def test_main_names_have_an_example() -> None:
-    named = {example.name.rpartition(".")[2] for file in FILES for example in _examples(file)}
-    assert sorted(MAIN - named) == []
 
 
 def _examples(file: Path) -> list[doctest.DocTest]:

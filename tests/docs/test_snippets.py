@@ -105,13 +105,6 @@ def test_commands_fit_a_page() -> None:
         assert [line for line in lines if len(line) > WIDTH] == [], f"{name(page)}: continue with a backslash"
 
 
-def test_every_idea_has_snippets() -> None:
-    for page in PAGES:
-        if page.parent.name == "ideas":
-            assert len([block for block in blocks(page) if block.language == "python"]) >= 2, name(page)
-            assert commands(page), name(page)
-
-
 @cache
 def _config_of_a_start() -> str:
     return yaml.safe_dump(composed(["preset=small", "recipe=strong", "backbone=imagenet"]))
