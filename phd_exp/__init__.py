@@ -52,3 +52,18 @@ def runs(folder: str | Path = "runs") -> Any:
     from phd_exp.inference.trained import runs_table
 
     return runs_table(Path(folder))
+
+
+def measured(folder: str | Path = "runs", report: str | Path = "report") -> Any:
+    """Every number of all runs under a folder, one row each, as a DataFrame; see `phd_exp.reports.numbers.COLUMNS`.
+
+    Measurements that `python -m phd_exp report` has stored in the folder `report` are not repeated. Raises UserError
+    without the extra `report`.
+    """
+    from phd_exp.records.errors import UserError
+
+    try:
+        from phd_exp.reports.report import measured
+    except ModuleNotFoundError as error:
+        raise UserError(f"{error}; `pip install 'phd_exp[report]'`") from None
+    return measured(Path(folder), Path(report) / "measured")

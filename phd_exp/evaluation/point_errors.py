@@ -128,9 +128,9 @@ def paired(one: Mapping[int, float], other: Mapping[int, float]) -> tuple[Interv
     k, gap = len(gaps), float(np.mean(list(one.values())) - np.mean(list(other.values())))
     if k < 2:
         return Interval(gap, -np.inf, np.inf), 1.0
-    gap, error = float(gaps.mean()), max(float(gaps.std(ddof=1)) / k**0.5, np.finfo(float).tiny)
+    gap, error = float(gaps.mean()), float(gaps.std(ddof=1)) / k**0.5
     half_width = float(special.stdtrit(k - 1, 0.975)) * error
-    p_value = float(2 * special.stdtr(k - 1, -abs(gap) / error))
+    p_value = float(2 * special.stdtr(k - 1, -abs(gap) / error)) if error > 0 else float(gap == 0)
     return Interval(gap, gap - half_width, gap + half_width), p_value
 
 

@@ -46,7 +46,7 @@ def runs_table(folder: Path) -> Any:
     rows = [_row(run) for run in find_runs(folder)]
     if find_spec("pandas") is None:
         return rows
-    import pandas as pd  # type: ignore[import-untyped]
+    import pandas as pd
 
     return pd.DataFrame(rows)
 

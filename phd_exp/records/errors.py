@@ -25,7 +25,7 @@ EXTRAS = {
     "torchvision": "train", "bpy": "render", "matplotlib": "report", "plotly": "report", "jinja2": "report",
     "onnx": "export", "onnxscript": "export", "onnxruntime": "export", "optuna": "search", "tensorboard": "loggers",
     "mlflow": "loggers", "timm": "timm", "av": "video", "joblib": "launchers", "submitit": "launchers", "ray": "ray",
-    "rosbags": "ros",
+    "rosbags": "ros", "pandas": "report",
 }  # fmt: skip
 """Optional package -> the extra of phd_exp that installs it."""
 READABLE = "make it a readable file"

@@ -1,30 +1,22 @@
-"""Tables as files: GitHub's Markdown, LaTeX that needs the package booktabs alone, and CSV."""
+"""Tables as files: GitHub's Markdown, LaTeX that needs the package booktabs alone, CSV and Parquet."""
 
-import csv
 import io
 import re
-import shlex
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from functools import partial
 from itertools import groupby
 from pathlib import Path
-from typing import Any
 
-from phd_exp.records.choices import PLAIN_RECIPE, preset_and_recipe
+import pandas as pd
+
+from phd_exp.evaluation.point_errors import COLUMNS
 from phd_exp.records.errors import one_line
 from phd_exp.records.written import Written
-from phd_exp.reports.calibration_table import calibration_tables
-from phd_exp.reports.cells import interval
-from phd_exp.reports.ensembles import ensemble_tables
-from phd_exp.reports.fusion import fusion_tables
-from phd_exp.reports.heads_table import heads_tables
+from phd_exp.reports.kinds import chosen
 from phd_exp.reports.paper_tables import paper_tables
-from phd_exp.reports.runs import Report, Run
-from phd_exp.reports.searches import search_tables
-from phd_exp.reports.shift_tables import shift_tables
-from phd_exp.reports.table import Table, TableCell, TableRow, bounds
-from phd_exp.reports.tracks import tracks_tables
-from phd_exp.reports.variations import variation_tables
+from phd_exp.reports.report import Report
+from phd_exp.reports.table import Table, TableCell, TableRow
+from phd_exp.reports.tables import other_tables
 
 SPECIAL = re.compile(r"([\\`*_\[\]<>#|~&@$])")
 """Characters that GitHub may read as markup, a mention, an issue or mathematics."""
@@ -52,74 +44,46 @@ SYMBOLS = {
 }
 
 
+RUNS = (
+    "preset data model seed overrides=digest estimate=method reading=subject quantity mean=value low high n_test=n "
+    "command git_commit machine"
+)
+
+
 def all_tables(report: Report) -> list[Table]:
     """The paper's tables, and all others for which there are runs; the report notes those that cannot be made."""
-    makers = (
-        paper_tables,
-        heads_tables,
-        calibration_tables,
-        ensemble_tables,
-        shift_tables,
-        variation_tables,
-        fusion_tables,
-        tracks_tables,
-        search_tables,
-    )
-    found = (report.notes.attempt(partial(make, report), f"{make.__name__}: ") or [] for make in makers)
-    return [table for tables in found for table in tables]
+    return [*(report.notes.attempt(partial(paper_tables, report), "paper's tables: ") or []), *other_tables(report)]
 
 
 def write_tables(report: Report, tables: Sequence[Table], out: Path) -> Path:
-    """Write `<stem>.{md,tex}` per table, `<kind>.csv` per kind and `runs.csv`; returns the folder, `<out>/tables`."""
+    """Write the long table, `measured.parquet` and `measured.csv`, and the folder `<out>/tables`, which is returned.
+
+    It has `<stem>.{md,tex}` per table, `<kind>.csv` per kind, and `runs.csv`, a line for every error of every run.
+    """
+    with Written(out, "measured") as written:
+        long = report.long
+        long.to_parquet(buffer := io.BytesIO(), index=False)
+        written.write("measured.parquet", buffer.getvalue())
+        written.write("measured.csv", csv_of(long))
     with Written(out / "tables", "report") as written:
         for table in tables:
             written.write(f"{table.stem}.md", markdown(table))
             written.write(f"{table.stem}.tex", latex(table))
         for kind, alike in groupby(tables, key=lambda table: table.kind):
-            written.write(f"{kind}.csv", tidy([line for table in alike for line in table.numbers]))
-        written.write("runs.csv", tidy(run_lines(report)))
+            written.write(f"{kind}.csv", csv_of(pd.concat([table.lines for table in alike])))
+        written.write("runs.csv", csv_of(run_lines(report)))
     return out / "tables"
 
 
-def run_lines(report: Report) -> list[dict[str, Any]]:
+def run_lines(report: Report) -> pd.DataFrame:
     """A line for every error of every finished run, and one for its NLL, whose interval is not computed."""
-    return [
-        run.choice
-        | {"seed": run.seed, "overrides": run.digest}
-        | number
-        | {"command": command_of(run), "git_commit": run.status.git_commit, "machine": run.status.machine}
-        for run in report.runs
-        if run.state == "finished" and run.status
-        for number in _numbers(run)
-    ]
+    found = report.select(split="test", subject=["whole", "central"], method=[*COLUMNS, "eight views", ""])
+    return chosen(found[(found["state"] == "finished") & (found["command"] != "")], RUNS)
 
 
-def _numbers(run: Run) -> Iterator[dict[str, Any]]:
-    for key, mean in run.errors.items():
-        name = {"estimate": key.estimate, "reading": key.reading, "quantity": f"{key.quantity}_error_mm"}
-        yield name | {"mean": mean.value, **bounds(interval([mean])), "n_test": mean.n}
-    if run.nll is not None:
-        n = max(mean.n for mean in run.errors.values())
-        name = {"estimate": "", "reading": "whole", "quantity": "nll"}
-        yield name | {"mean": run.nll, **bounds(None), "n_test": n}
-
-
-def command_of(run: Run) -> str:
-    """The command line that makes a run."""
-    preset, recipe = preset_and_recipe(run.preset)
-    words = [f"preset={preset}", f"data={run.data}", f"model={run.model}", f"seed={run.seed}"]
-    words += [f"recipe={recipe}"] if recipe != PLAIN_RECIPE else []
-    words += run.status.overrides if run.status else []
-    return one_line(shlex.join(["python", "-m", "phd_exp", *words]))
-
-
-def tidy(numbers: Sequence[Mapping[str, Any]]) -> str:
+def csv_of(lines: pd.DataFrame) -> str:
     """CSV with a line per number, at full precision; missing values are empty."""
-    stream = io.StringIO()
-    writer = csv.DictWriter(stream, list(numbers[0]) if numbers else [], lineterminator="\n")
-    writer.writeheader()
-    writer.writerows({key: one_line(v) if isinstance(v, str) else v for key, v in line.items()} for line in numbers)
-    return stream.getvalue()
+    return lines.to_csv(index=False, lineterminator="\n")
 
 
 def markdown(table: Table) -> str:

@@ -14,7 +14,8 @@ from phd_exp.records.written import Written
 from phd_exp.reports.figures import LABELS, decades, draw_birds_eye, draw_identity, draw_on_image, encoded
 from phd_exp.reports.gallery import curves_of, images_folder, load_image
 from phd_exp.reports.paper import PUBLISHED
-from phd_exp.reports.runs import PROBABILISTIC, Report, Run
+from phd_exp.reports.report import Report
+from phd_exp.reports.runs import PROBABILISTIC, Run
 from phd_exp.reports.table import file_stem
 
 LONGEST_NAME = 30
@@ -50,9 +51,12 @@ def _files(draw: Callable[[], Figure | None]) -> dict[str, bytes]:
 
 def _first_seeds(report: Report, preset: str) -> list[Run]:
     order = dict.fromkeys([*(data for _, data in PUBLISHED), *sorted({run.data for run in report.runs})])
-    found = [report.at_defaults(preset, data, PROBABILISTIC) for data in order]
-    measured = [[run for _, run in sorted(runs.items()) if run.measured.before] for runs in found]
-    return [runs[0] for runs in measured if runs]
+    found = {
+        run.data: run
+        for run in sorted(report.runs, key=lambda run: -(run.seed or 0))
+        if (run.preset, run.model) == (preset, PROBABILISTIC) and run.overrides is None and run.measured.before
+    }
+    return [found[data] for data in order if data in found]
 
 
 def _calibration(runs: Sequence[Run]) -> Figure | None:

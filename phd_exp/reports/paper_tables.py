@@ -2,24 +2,25 @@
 
 import shlex
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from functools import partial
 from itertools import chain, product
+from typing import Any
 
-from phd_exp.evaluation.point_errors import COLUMNS, READINGS, ErrorKey, Estimate, Quantity, Reading
+import pandas as pd
+
+from phd_exp.evaluation.point_errors import COLUMNS, READINGS, Estimate, Quantity, Reading, paired
 from phd_exp.records.choices import PLAIN_RECIPE, in_words, preset_and_recipe
 from phd_exp.records.errors import one_line
-from phd_exp.reports.cells import Cell, make_cell
-from phd_exp.reports.paper import ASSUMED, BELOW_BOUND, LAYOUTS, OF_A_BOUND, Layout, TableName
-from phd_exp.reports.runs import PROBABILISTIC, Report, Run
-from phd_exp.reports.table import NOTHING, Table, TableCell, TableRow, file_stem, plus_minus
+from phd_exp.reports.numbers import over_seeds
+from phd_exp.reports.paper import ASSUMED, BELOW_BOUND, LAYOUTS, OF_A_BOUND, PUBLISHED, Layout, TableName, bound_mm
+from phd_exp.reports.quantities import NOTHING
+from phd_exp.reports.report import Report
+from phd_exp.reports.runs import PROBABILISTIC
+from phd_exp.reports.table import Table, TableCell, TableRow, file_stem
 
 DIGITS: dict[Quantity, int] = {"projected": 1, "depth": 0}  # decimals of a millimetre, as in the paper
 OTHERS: tuple[Estimate, ...] = ("mean", "median", "eight views")  # of the density; the paper reports its mode alone
-Begun = Mapping[tuple[str, str], Mapping[int, Run]]
-"""(data set, model) -> seed -> run, where there are any."""
 ONE_SEED = "†"
 FEWER_SEEDS = "‡"
-
 IN_WORDS: dict[Reading, str] = {
     "whole": "the whole field of view",
     "central": "the central half of the field of view",
@@ -41,93 +42,160 @@ OF_AN_INTERVAL = {
     "none": "No ±: one seed, one test sample.",
 }
 OF_FEWER_SEEDS = f"{FEWER_SEEDS}: fewer seeds than other cells of this table."
+CSV = (
+    *("preset", "table", "data", "model", "estimate", "reading", "quantity", "n_seeds", "mean", "low", "high"),
+    *("interval", "published", "ratio", "bound", "best", "n_test", "state"),
+)  # fmt: skip
+Cell = dict[str, Any]
+"""A number of a table: the columns of `CSV`; `values` and `images` of its seeds; `gaps`, why a seed is missing."""
 
 
 def paper_tables(report: Report) -> list[Table]:
     """Both tables in both readings, for every preset that has any of a table's runs."""
+    facts = report.facts
+    plain = facts[facts["seed"].notna() & (facts.get("words", "") == "")]
+    errors = [f"{quantity}_error_mm" for quantity in DIGITS]
+    known = report.select(split="test", quantity=errors, method=[*COLUMNS, "eight views"])
+    known = known[known["seed"].notna() & (known["words"] == "")]
     tables = []
     for preset in report.presets:
         for layout in LAYOUTS:
-            choices = product(layout.data, layout.models)
-            begun = {choice: runs for choice in choices if (runs := report.at_defaults(preset, *choice))}
-            tables += [_table(report, preset, layout, begun, reading) for reading in READINGS if begun]
+            begun = plain[plain["data"].isin(layout.data) & plain["model"].isin(layout.models)]
+            begun = begun[begun["preset"] == preset]
+            own = known[known["path"].isin(begun["path"])]
+            tables += [_table(report, preset, layout, begun, own, reading) for reading in READINGS if len(begun)]
     return tables
 
 
-def _table(report: Report, preset: str, layout: Layout, begun: Begun, reading: Reading) -> Table:
+def _table(
+    report: Report, preset: str, layout: Layout, begun: pd.DataFrame, known: pd.DataFrame, reading: Reading
+) -> Table:
     """The table of a layout, reduced to the data sets and models with a run."""
-    data = [name for name in layout.data if any(name == choice[0] for choice in begun)]
-    models = [name for name in layout.models if any(name == choice[1] for choice in begun)]
-    seeds = sorted({seed for runs in begun.values() for seed in runs})
+    data = [name for name in layout.data if name in set(begun["data"])]
+    models = [name for name in layout.models if name in set(begun["model"])]
     is_by_line = len(layout.data) > 1  # whether each error has a line
+    cells = _cells(layout.name, begun, known, reading)
 
-    def rows(model: str, estimate: Estimate) -> list[list[Cell]]:
-        keys = [ErrorKey(estimate, reading, quantity) for quantity in DIGITS]
-        cells = [[make_cell(report, preset, name, model, key, seeds) for name in data] for key in keys]
-        return cells if is_by_line else [[*chain(*cells)]]
+    def rows(model: str, estimate: str) -> list[list[Cell]]:
+        each = [[cells[name, model, estimate, quantity] for name in data] for quantity in DIGITS]
+        return each if is_by_line else [[*chain(*each)]]
 
-    measured = [[row for line in group for row in rows(*line)] for group in _groups(models, begun)]
-    cells = [cell for group in measured for row in group for cell in row]
-    best = _best([*chain(*measured[0])])
-    gaps = dict.fromkeys((reason, one.model, one.data, n) for one in cells for n, reason in one.gaps.items())
+    groups = [[row for line in group for row in rows(*line)] for group in _groups(models, known)]
+    shown = [cell for group in groups for row in group for cell in row]
+    _find_best([*chain(*groups[0])])
+    gaps = dict.fromkeys((reason, one["model"], one["data"], n) for one in shown for n, reason in one["gaps"].items())
+    can_be_made = any(not reason.startswith("no sample") for reason, *_ in gaps)
     left_out = ", ".join(name for name in (*layout.data, *layout.models) if name not in (*data, *models))
-    can_be_made = left_out or any(not reason.startswith("no sample") for reason, *_ in gaps)
-    groups = [tuple(_row(row, is_by_line, layout.name, best) for row in group) for group in measured]
     return Table(
         stem=file_stem(layout.name, preset, reading),
         kind="tables",
-        title=f"The paper's {layout.title}, {in_words(preset)}: {IN_WORDS[reading]}{_samples(cells)}",
+        title=f"The paper's {layout.title}, {in_words(preset)}: {IN_WORDS[reading]}{_samples(shown)}",
         stub=("model", "error (mm)") if is_by_line else ("model",),
         columns=tuple(data if is_by_line else (f"{quantity} error (mm)" for quantity in DIGITS)),
-        groups=(*groups, tuple(_bound_rows(layout, data, is_by_line))),
-        notes=_notes(layout, reading, cells, left_out),
+        groups=(
+            *(tuple(_row(row, is_by_line) for row in group) for group in groups),
+            tuple(_bound_rows(layout, data, is_by_line)),
+        ),
+        notes=_notes(layout, reading, shown, left_out),
         below="paper (ratio)",
         gaps=tuple(gap_lines(gaps)),
-        command=making_command(report, preset, layout.name, seeds) if can_be_made else "",
+        command=making_command(report, preset, layout.name, sorted(set(begun["seed"]))) if can_be_made else "",
         preset=preset,
         reading=reading,
+        lines=pd.DataFrame([{name: cell[name] for name in CSV} for cell in shown], dtype=object),
     )
 
 
-def _groups(models: Sequence[str], begun: Begun) -> Iterator[list[tuple[str, Estimate]]]:
+def _groups(models: Sequence[str], known: pd.DataFrame) -> Iterator[list[tuple[str, str]]]:
     """The paper's lines, then the density's other estimates; eight views only if a run has recorded them."""
     yield [(model, "mode") for model in models]
-    known = {*COLUMNS, *(key.estimate for runs in begun.values() for run in runs.values() for key in run.errors)}
+    recorded = {*COLUMNS, *known["method"]}
     if PROBABILISTIC in models:
-        yield [(PROBABILISTIC, estimate) for estimate in OTHERS if estimate in known]
+        yield [(PROBABILISTIC, estimate) for estimate in OTHERS if estimate in recorded]
 
 
-def _best(cells: Sequence[Cell]) -> set[int]:
-    """The ids of the cells that are significantly better than every other of their data set and error."""
-    best = set()
+def _cells(
+    table: TableName, begun: pd.DataFrame, known: pd.DataFrame, reading: Reading
+) -> dict[tuple[str, str, str, Quantity], Cell]:
+    """(data set, model, estimate, quantity) -> number, of all that a preset may have."""
+    keys = ["data", "model", "method", "quantity"]
+    known = known[known["subject"] == reading]
+    means = {(row.data, row.model, row.method, row.quantity): row for row in over_seeds(known).itertuples()}
+    tested = dict(iter(known.groupby(keys, sort=False)))
+    runs = {place: {int(one.seed): one for one in part.itertuples()} for place, part in begun.groupby(keys[:2])}
+    seeds = sorted({int(seed) for seed in begun["seed"]})
+    found: dict[tuple[str, str, str, Quantity], Cell] = {}
+    places = product(begun["data"].unique(), begun["model"].unique(), (*COLUMNS, "eight views"), DIGITS)
+    for data, model, estimate, quantity in places:
+        key = data, model, estimate, f"{quantity}_error_mm"
+        started, part, mean = runs.get((data, model), {}), tested.get(key, known[:0]), means.get(key)
+        values = {int(seed): value for seed, value in zip(part["seed"], part["value"], strict=True)}
+        gaps = {seed: _reason(started.get(seed), estimate) for seed in seeds if started and seed not in values}
+        published = PUBLISHED.get((model, data), {}).get(quantity) if estimate == "mode" else None
+        low, high = (None, None) if mean is None or pd.isna(mean.low) else (mean.low, mean.high)
+        scatter = "none" if low is None else "seeds_and_samples" if len(values) > 1 else "samples"
+        found[data, model, estimate, quantity] = {
+            "preset": begun["preset"].iloc[0], "table": table, "data": data, "model": model, "estimate": estimate,
+            "reading": reading, "quantity": key[-1], "n_seeds": len(values), "mean": mean.value if mean else None,
+            "low": low, "high": high, "interval": scatter,
+            "published": published, "ratio": mean.value / published if mean and published else None,
+            "bound": bound_mm(model, data, quantity, "shown" in set(part["camera"])), "best": False,
+            "n_test": int(mean.n) if mean else 0, "state": _state(values, gaps), "values": values, "gaps": gaps,
+            "images": set(part["images"]), "counts": set(part["n"]),
+        }  # fmt: skip
+    return found
+
+
+def _state(values: Mapping[int, float], gaps: Mapping[int, str]) -> str:
+    """`finished`, the reason for a missing number, or the number of finished seeds."""
+    if values and gaps:
+        return f"{len(values)} of {len(values) + len(gaps)} seeds"
+    return "finished" if values else next(iter(gaps.values()), NOTHING).partition(":")[0]
+
+
+def _reason(run: Any, estimate: str) -> str:
+    """Why a run has no error: a state, and details."""
+    if run is None:
+        return "missing"
+    if run.state == "finished" and estimate == "eight views":
+        return "no eight views: repeat its command with evaluation.eight_views=true"
+    if run.state == "finished":
+        return "no sample: none of its test samples lies in the central half"
+    return f"{run.state}: {run.detail}" if run.detail else run.state
+
+
+def _find_best(cells: Sequence[Cell]) -> None:
+    """Mark the cells that are significantly smaller than every other of their data set and error."""
     for cell in cells:
-        column = [one for one in cells if (one.data, one.key.quantity) == (cell.data, cell.key.quantity)]
-        others = [one for one in column if one.means and one is not cell]
-        if cell.means and others and all(map(cell.beats, others)):
-            best.add(id(cell))
-    return best
+        column = [one for one in cells if (one["data"], one["quantity"]) == (cell["data"], cell["quantity"])]
+        others = [one for one in column if one["values"] and one is not cell]
+        cell["best"] = bool(others and cell["values"]) and all(
+            len(cell["images"] | one["images"]) == 1 and paired(cell["values"], one["values"])[0].high < 0
+            for one in others
+        )
 
 
-def _row(cells: Sequence[Cell], is_by_line: bool, table: TableName, best: set[int]) -> TableRow:
-    model, key = cells[0].model, cells[0].key
-    label = f"{model} ({key.estimate})" if model == PROBABILISTIC else model
-    stub = (label, key.quantity) if is_by_line else (label,)
-    return TableRow(stub, tuple(_table_cell(cell, table, id(cell) in best) for cell in cells))
+def _row(cells: Sequence[Cell], is_by_line: bool) -> TableRow:
+    model, quantity = cells[0]["model"], cells[0]["quantity"].removesuffix("_error_mm")
+    label = f"{model} ({cells[0]['estimate']})" if model == PROBABILISTIC else model
+    return TableRow((label, quantity) if is_by_line else (label,), tuple(map(_table_cell, cells)))
 
 
-def _table_cell(cell: Cell, table: TableName, bold: bool) -> TableCell:
-    number, numbers = partial(_number, cell.key.quantity), (cell.numbers(table, bold),)
-    paper = "" if cell.published is None else number(cell.published)
-    if cell.mean is None:
-        return TableCell(cell.state, below=paper, numbers=numbers)
-    paper += "" if cell.ratio is None else f" (×{cell.ratio:.2f})"
-    marks = {ONE_SEED: cell.scatter == "samples", BELOW_BOUND: cell.is_below_bound, FEWER_SEEDS: bool(cell.gaps)}
-    spread = plus_minus(cell.interval, number) + "".join(mark for mark, holds in marks.items() if holds)
-    return TableCell(number(cell.mean), spread, paper, bold, numbers=numbers)
+def _table_cell(cell: Cell) -> TableCell:
+    digits = DIGITS[cell["quantity"].removesuffix("_error_mm")]
+    paper = "" if cell["published"] is None else f"{cell['published']:.{digits}f}"
+    if cell["mean"] is None:
+        return TableCell(cell["state"], below=paper)
+    paper += "" if cell["ratio"] is None else f" (×{cell['ratio']:.2f})"
+    marks = {ONE_SEED: cell["interval"] == "samples", BELOW_BOUND: _is_below(cell), FEWER_SEEDS: bool(cell["gaps"])}
+    spread = "" if cell["low"] is None else f"±{(cell['high'] - cell['low']) / 2:.{digits}f}"
+    spread += "".join(mark for mark, holds in marks.items() if holds)
+    return TableCell(f"{cell['mean']:.{digits}f}", spread, paper, cell["best"])
 
 
-def _number(quantity: Quantity, value: float) -> str:
-    return f"{value:.{DIGITS[quantity]}f}"
+def _is_below(cell: Cell) -> bool:
+    """Whether the mean is smaller than its bound, by chance or because more is known than the bound assumes."""
+    return cell["mean"] is not None and cell["bound"] is not None and cell["mean"] < cell["bound"]
 
 
 def _bound_rows(layout: Layout, data: Sequence[str], is_by_line: bool) -> Iterator[TableRow]:
@@ -141,11 +209,12 @@ def _bound_rows(layout: Layout, data: Sequence[str], is_by_line: bool) -> Iterat
 
 def _notes(layout: Layout, reading: Reading, cells: Sequence[Cell], left_out: str) -> tuple[str, ...]:
     """The notes that explain the contents of a table."""
-    kinds = {cell.scatter for cell in cells if cell.means}
+    measured = [cell for cell in cells if cell["values"]]
+    kinds = {cell["interval"] for cell in measured}
     notes = {OF_THE_READING[reading]: True, OF_A_CELL: True}
     notes |= {text: kind in kinds for kind, text in OF_AN_INTERVAL.items()}
-    notes[OF_FEWER_SEEDS] = any(cell.means and cell.gaps for cell in cells)
-    notes[OF_A_BOUND] = any(cell.is_below_bound for cell in cells)
+    notes[OF_FEWER_SEEDS] = any(cell["gaps"] for cell in measured)
+    notes[OF_A_BOUND] = any(map(_is_below, measured))
     notes |= {ASSUMED: True, layout.note: True, OF_THE_SPLITS: True}
     notes[f"Left out of {layout.title}, without a run: {left_out}."] = bool(left_out)
     return tuple(text for text, applies in notes.items() if applies)
@@ -153,10 +222,8 @@ def _notes(layout: Layout, reading: Reading, cells: Sequence[Cell], left_out: st
 
 def _samples(cells: Sequence[Cell]) -> str:
     """The number of test samples; a range if runs were tested on different numbers of them."""
-    counts = sorted({mean.n for cell in cells for mean in cell.means.values()})
-    if not counts:
-        return ""
-    return f", {' to '.join(map(str, dict.fromkeys([counts[0], counts[-1]])))} test samples"
+    counts = sorted({int(n) for cell in cells for n in cell["counts"]})
+    return f", {' to '.join(map(str, dict.fromkeys([counts[0], counts[-1]])))} test samples" if counts else ""
 
 
 def gap_lines(gaps: Iterable[tuple[str, str, str, int]]) -> list[str]:

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 
 from phd_exp.metrics.bootstrap import Interval
 
+NOTHING = "–"
+
 
 @dataclass(frozen=True)
 class Quantity:
@@ -28,15 +30,36 @@ class Quantity:
         return f"{self.label} ({self.unit})" if self.unit else self.label
 
     def text(self, value: float | None) -> str:
-        """A value with its digits; a dash if it is missing or not finite.
+        """A value with its digits; a dash if it is missing or not finite; from 100 mm on, whole millimetres.
 
         Examples:
-            >>> SCORES["depth_error_mm"].text(47.96)
-            '48.0'
+            >>> SCORES["depth_error_mm"].text(47.96), SCORES["depth_error_mm"].text(347.96)
+            ('48.0', '348')
         """
         if value is None or not math.isfinite(value):
-            return "–"
-        return f"{value:.{self.digits}f}".replace("-", "−")
+            return NOTHING
+        return f"{value:.{self.digits_of(value)}f}".replace("-", "−")
+
+    def digits_of(self, value: float) -> int:
+        """The digits with which a value is shown."""
+        return 0 if self.unit == "mm" and abs(value) >= 100 else self.digits
+
+    def signed(self, value: float) -> str:
+        """A difference with its sign."""
+        return f"{'+' if value > 0 else ''}{self.text(value)}"
+
+    def band(self, low: float, high: float) -> str:
+        """An interval in round brackets.
+
+        Examples:
+            >>> SCORES["nll"].band(-2, 1.5)
+            '(−2.00 to 1.50)'
+        """
+        return f"({self.text(low)}{'–' if low >= 0 else ' to '}{self.text(high)})"
+
+    def half(self, value: float, low: float, high: float) -> str:
+        """Half the width of a symmetric interval, such as `±3`, with the digits of the value; empty without one."""
+        return f"±{(high - low) / 2:.{self.digits_of(value)}f}" if math.isfinite(high - low) else ""
 
 
 def mark(value: float, calibrated: Interval[float] | None) -> str:
@@ -58,6 +81,9 @@ _NEES = "squared error of the mean over the predicted covariance; 3 if calibrate
 _OVERCONFIDENCE = "mean credible level of the truths minus 1/2; negative if underconfident"
 _INSIDE = "share of truths inside the credible region"
 _CONFORMAL = "share of truths inside; held-out samples set its level"
+_ELLIPSOID = "share of truths inside the ellipsoid of mean and covariance that holds as much of a Gaussian"
+_SQUARED = "squared Mahalanobis distance per dimension; 1 if calibrated, more if overconfident"
+_HIDDEN = "of the frames that hide most of the object"
 _SHARPNESS = "root mean square of the predicted deviation of"
 _ROWS: tuple[tuple[str, str, str, int, str], ...] = (
     ("projected_error_mm", "Projected error", "mm", 1, "distance of the estimate from the true viewing ray"),
@@ -90,9 +116,25 @@ _ROWS: tuple[tuple[str, str, str, int, str], ...] = (
     ("projected_risk_coverage_area", "Projected risk–coverage area", "mrad", 2, _RISK),
     ("depth_risk_coverage_excess", "Depth risk–coverage excess", "", 3, _EXCESS),
     ("projected_risk_coverage_excess", "Projected risk–coverage excess", "", 3, _EXCESS),
+    ("level", "Mean level", "", 3, "mean credible level of the truths; 0.5 if calibrated, more if overconfident"),
+    ("distance_mm", "Distance from the truth", "mm", 1, "distance in space"),
+    *((f"coverage_{level}", f"Inside the {level} % ellipsoid", "%", 0, _ELLIPSOID) for level in (50, 90, 99)),
+    ("normalised_squared_error", "Squared error over predicted", "", 2, _SQUARED),
+    ("gain", "Depth error less than that of Kalman", "mm", 1, "positive if smaller than that of a Kalman smoother"),
+    ("ratio/depth_error_mm", "Depth error over that of single frames", "", 2, "below 1 if smoothing helps"),
+    ("hidden/depth_error_mm", "Depth error, hidden", "mm", 1, _HIDDEN),
+    ("hidden/projected_error_mm", "Projected error, hidden", "mm", 1, _HIDDEN),
+    ("ratio/hidden/depth_error_mm", "Depth error over that of single frames, hidden", "", 2, _HIDDEN),
 )
 SCORES = {key: Quantity(label, unit, digits, means) for key, label, unit, digits, means in _ROWS}
-"""Key of `Evaluation.scores` -> quantity, in the order of a page."""
+"""Key of a number -> quantity, in the order of a page."""
+
+METHODS = {
+    "mode": "Huber, mode", "mean": "Huber, mean", "shared": "shared", "average": "average", "gaussian": "Gaussian",
+    "single": "single frames", "kalman": "Kalman (RTS)", "independent": "ours, independent frames",
+    "slow": "ours, weighted frames",
+}  # fmt: skip
+"""Method of fusion or of smoothing -> its name."""
 
 METRICS = {
     "projected_error_mm": SCORES["projected_error_mm"],

@@ -1,8 +1,8 @@
-"""Reads and measures every recorded run, each inside one boundary: a broken record only affects its own page."""
+"""Reads and measures a recorded run inside one boundary: a broken record only affects its own page."""
 
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -12,9 +12,7 @@ from phd_exp.evaluation.parquet import Arrays, read_table
 from phd_exp.evaluation.point_errors import COLUMNS, Estimate, MeanErrors, mean_errors
 from phd_exp.records.choices import flatten, has_influence
 from phd_exp.records.errors import READABLE, RunError, one_line
-from phd_exp.records.files import make_folder
-from phd_exp.records.runs import AGAIN, SECTIONS, RunFolder, RunStatus, choosing, find_runs
-from phd_exp.records.searches import Search, read_searches
+from phd_exp.records.runs import AGAIN, SECTIONS, RunFolder, RunStatus, choosing
 from phd_exp.reports.measured import Measured, Notes, kept_or_measured, measure
 from phd_exp.reports.table import file_stem, printable
 
@@ -70,11 +68,6 @@ class Run:
         return f"{self.preset}/{self.data}/{self.model}/{self.name}"
 
     @property
-    def choice(self) -> dict[str, Any]:
-        """Preset, data set and model, as columns of CSV."""
-        return {"preset": self.preset, "data": self.data, "model": self.model}
-
-    @property
     def digest(self) -> str:
         """The hash of the overrides in its name, equal for all seeds and models with the same ones; else empty."""
         return self.name.partition("-")[2]
@@ -85,48 +78,10 @@ class Run:
         return file_stem(*self.folder.names)
 
 
-@dataclass(frozen=True)
-class Report:
-    """All runs and searches under a folder, sorted: read once for the terminal, the files and the pages.
-
-    `notes` are the problems of tables, figures and searches, which belong to no page.
-    """
-
-    folder: Path
-    runs: tuple[Run, ...]
-    searches: tuple[Search, ...] = ()
-    notes: Notes = field(default_factory=Notes)
-
-    @property
-    def presets(self) -> list[str]:
-        """All presets, with their recipes, sorted."""
-        return sorted({run.preset for run in self.runs})
-
-    def at_defaults(self, preset: str, data: str, model: str) -> dict[int, Run]:
-        """Seed -> run, of the runs without overrides that change the law of their results."""
-        choice = (preset, data, model)
-        return {
-            run.seed: run
-            for run in self.runs
-            if run.overrides is None and run.seed is not None and (run.preset, run.data, run.model) == choice
-        }
-
-
-def read_report(runs: Path, kept: Path | None = None, progress: Callable[[str], None] = lambda run: None) -> Report:
-    """Read and measure every run; the folder `kept`, if given, stores measurements until their run changes.
-
-    Raises OSError if that folder cannot be written.
-    """
-    found = []
-    folders = find_runs(runs)
-    if folders and kept:
-        make_folder(kept)
-    for folder in folders:
-        progress("/".join(map(printable, folder.names)))
-        notes = Notes()
-        run = notes.attempt(partial(_whole_run, unreadable(folder, []), kept, notes))
-        found.append(run or unreadable(folder, notes))
-    return Report(runs, tuple(found), tuple(read_searches(runs)))
+def read_run(folder: RunFolder, kept: Path | None = None) -> Run:
+    """Read and measure a run inside its boundary; the folder `kept` stores measurements until the run changes."""
+    notes = Notes()
+    return notes.attempt(partial(_whole_run, unreadable(folder, []), kept, notes)) or unreadable(folder, notes)
 
 
 def unreadable(folder: RunFolder, notes: Sequence[str]) -> Run:

@@ -3,14 +3,15 @@
 import hashlib
 import os
 import re
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from phd_exp.metrics.bootstrap import Interval
-from phd_exp.records.errors import one_line
+import pandas as pd
 
-NOTHING = "–"
+from phd_exp.records.errors import one_line
+from phd_exp.reports.quantities import NOTHING
+
 LONGEST_STEM = 120
 
 
@@ -24,7 +25,6 @@ class TableCell:
         below: a second line, such as the paper's figure.
         bold: whether `ours` is significantly the best.
         tone: how bad the number is: "off" for a warning, "broken" for a failure.
-        numbers: its lines of CSV at full precision: one, one for each run that it averages, or none.
     """
 
     ours: str
@@ -32,7 +32,6 @@ class TableCell:
     below: str = ""
     bold: bool = False
     tone: Literal["", "off", "broken"] = ""
-    numbers: tuple[Mapping[str, Any], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -55,7 +54,7 @@ class Table:
         below: the meaning of the cells' second lines.
         notes: explanations, a sentence or two each.
         gaps: missing runs, a line each; `command` makes them.
-        cells: all cells in the order of CSV, if some are in no row or the rows have another order.
+        lines: the lines of its CSV file, at full precision.
     """
 
     stem: str
@@ -70,13 +69,7 @@ class Table:
     command: str = ""
     preset: str = ""
     reading: str = ""
-    cells: tuple[TableCell, ...] = ()
-
-    @property
-    def numbers(self) -> list[Mapping[str, Any]]:
-        """The lines of CSV of all cells."""
-        cells = self.cells or [cell for row in self.rows for cell in row.cells]
-        return [line for cell in cells for line in cell.numbers]
+    lines: pd.DataFrame = field(default_factory=pd.DataFrame, repr=False, compare=False)
 
     @property
     def rows(self) -> tuple[TableRow, ...]:
@@ -84,14 +77,23 @@ class Table:
         return tuple(row for group in self.groups for row in group)
 
 
-def bounds(interval: Interval[float] | None) -> dict[str, float | None]:
-    """The columns `low` and `high` of CSV."""
-    return {"low": interval.low, "high": interval.high} if interval else {"low": None, "high": None}
+def pivot(
+    found: pd.DataFrame, stub: Sequence[str], column: str, group: str
+) -> tuple[tuple[str, ...], tuple[tuple[TableRow, ...], ...]]:
+    """The headings and the groups of rows of a table, all in the order in which they first occur.
 
-
-def plus_minus(interval: Interval[float] | None, text: Callable[[float], str]) -> str:
-    """Half the width of a symmetric interval, such as `±3`; empty without one."""
-    return f"±{text((interval.high - interval.low) / 2)}" if interval else ""
+    Args:
+        found: a row for each cell, with the columns `stub`, `column`, `group` and `cell`.
+    """
+    columns = tuple(dict.fromkeys(found[column]))
+    groups: dict[Any, dict[tuple[str, ...], dict[str, TableCell]]] = {}
+    labels = found[list(stub)].itertuples(index=False, name=None)
+    for of, label, heading, cell in zip(found[group], labels, found[column], found["cell"], strict=True):
+        groups.setdefault(of, {}).setdefault(label, {})[heading] = cell
+    return columns, tuple(
+        tuple(TableRow(label, tuple(cells.get(one, TableCell(NOTHING)) for one in columns)) for label, cells in rows)
+        for rows in map(dict.items, groups.values())
+    )
 
 
 def printable(name: str) -> str:

@@ -21,7 +21,7 @@ from phd_exp.records.errors import UserError
 from phd_exp.records.own_images import annotations, detections_in
 from phd_exp.records.runs import RunFolder, RunStatus
 from phd_exp.records.scenes import SampleRecord
-from phd_exp.reports.runs import read_report
+from phd_exp.reports.report import read_report
 from tests.support.foreign import WRITERS
 
 EXAMPLES = [20, pytest.param(2000, marks=[pytest.mark.slow, pytest.mark.timeout(1200)])]

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from pathlib import Path
 
+import pandas as pd
 import pytest
 
 from tests.support.recorded import predicted, record
@@ -19,10 +20,12 @@ def test_tables_are_printed_and_written(phd_exp: Callable, runs: Path, tmp_path:
     outcome = phd_exp("report")
     assert (outcome.status, outcome.err) == (0, "")
     assert "The paper's Table 1, preset small: the whole field of view" in outcome.out
-    assert "Table 1, preset small: the central half of the field of view" in outcome.out
-    assert "Made by: python -m phd_exp -m experiment=table1 preset=small\n" in outcome.out
-    assert "tables: report/tables\ndrawing figures and pages\nfigures: " in outcome.out
-    assert "Fusion" not in outcome.out
+    assert "small/occl/probabilistic/seed0" in outcome.out
+    assert "tables: report/tables\nfigures: " in outcome.out
+    assert len(outcome.out.splitlines()) <= 60
+    assert "Missing" not in outcome.out, "nobody has asked for the other runs of the table"
+    (long,) = {len(pd.read_csv(file)) for file in [tmp_path / "report" / "measured.csv"]}
+    assert len(pd.read_parquet(tmp_path / "report" / "measured.parquet")) == long > 20
     assert {path.name for path in (tmp_path / "report" / "tables").iterdir()} == {
         "table1-small-whole.md",
         "table1-small-whole.tex",
@@ -54,7 +57,7 @@ def test_pages_of_others_stay_and_leftovers_go(phd_exp: Callable, runs: Path, tm
     assert len(list((site / "runs").iterdir())) == 2
 
 
-def test_several_views_are_printed_and_written_where_they_are_recorded_and_both_folders_can_be_named(
+def test_several_views_are_shown_where_they_are_recorded_and_both_folders_can_be_named(
     phd_exp: Callable, runs: Path, tmp_path: Path
 ) -> None:
     runs = runs.rename(tmp_path / "elsewhere")
@@ -63,11 +66,9 @@ def test_several_views_are_printed_and_written_where_they_are_recorded_and_both_
     write_views(views, 6)
     outcome = phd_exp("report", "out=for the paper", "runs=elsewhere")
     assert (outcome.status, outcome.err) == (0, "")
-    assert "Fusion, preset small, probabilistic on occl, seed0: 6 scenes seen by 4 cameras" in outcome.out
     assert (out / "tables" / "fusion-small-occl-probabilistic-seed0.tex").exists()
     assert 'id="of-fusion"' in (out / "site" / "index.html").read_text()
     assert not (tmp_path / "report").exists()
-    assert "runs=elsewhere\n" in outcome.out
     views.write_bytes(b"torn")
     torn = phd_exp("report", "out=for the paper", "runs=elsewhere")
     assert torn.status == 0

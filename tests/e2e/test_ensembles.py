@@ -10,9 +10,10 @@ import pytest
 from phd_exp.evaluation.parquet import read_table
 from phd_exp.evaluation.predictions import ensemble_table
 from phd_exp.records.runs import RunFolder, find_runs
-from phd_exp.reports import ensembles
 from phd_exp.reports.files import write_tables
-from phd_exp.reports.runs import Report, Run
+from phd_exp.reports.report import Report
+from phd_exp.reports.runs import Run
+from phd_exp.reports.tables import ensembles
 from tests.support.synthetic import write_run
 from tests.support.untrained import read_lines, write_photos
 
@@ -49,7 +50,7 @@ def test_two_seeds_and_their_eight_views(own: Callable, phd_exp: Callable, tmp_p
         assert (outcome.status, outcome.err) == (0, "")
         assert len(read_lines(outcome.out)) == 2
 
-    (table,) = ensembles.ensemble_tables(report_of([first, second]))
+    (table,) = ensembles(report_of([first, second]))
     assert [row.stub[1] for row in table.rows] == ["one network", "2 seeds", "eight views, seed0"]
 
 
@@ -58,7 +59,7 @@ def test_a_table_of_one_two_three_and_five_seeds(tmp_path: Path) -> None:
     runs = [write_run(tmp_path, seed=seed, n=100) for seed in range(5)]
     runs += [write_run(tmp_path, n=20, overrides=("optimizer.lr=0.1",)), write_run(tmp_path, n=20, data="occl")]
     report = report_of(runs)
-    (table,) = ensembles.ensemble_tables(report)
+    (table,) = ensembles(report)
     assert [row.stub for row in table.rows] == [
         ("probabilistic on default", kind) for kind in ("one network", "2 seeds", "3 seeds", "5 seeds")
     ]

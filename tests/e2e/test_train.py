@@ -15,8 +15,8 @@ from PIL import Image
 
 from phd_exp.evaluation.point_errors import ErrorKey
 from phd_exp.records.runs import RunFolder
-from phd_exp.reports.files import command_of
-from phd_exp.reports.runs import read_report
+from phd_exp.reports.numbers import command_of
+from phd_exp.reports.report import read_report
 from phd_exp.training.module import PositionModule
 from tests.e2e.conftest import QUICK, QUICKER
 from tests.support.recorded import only_run, status_of

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from phd_exp.reports.measured import VERSIONS, Measured, kept_or_measured
-from phd_exp.reports.runs import read_report
+from phd_exp.reports.report import read_report
 from tests.support.sequences import write_sequences
 from tests.support.several import write_views
 from tests.support.synthetic import write_run

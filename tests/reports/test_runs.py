@@ -13,7 +13,8 @@ from phd_exp.records.choices import RunName
 from phd_exp.records.runs import RunFolder
 from phd_exp.reports import runs as runs_module
 from phd_exp.reports.measured import Measured, measure
-from phd_exp.reports.runs import Run, read_report
+from phd_exp.reports.report import read_report
+from phd_exp.reports.runs import Run
 from tests.support.recorded import predicted, record, status_of
 from tests.support.synthetic import write_run
 
@@ -65,9 +66,6 @@ def test_runs_with_other_overrides_are_apart_and_say_which(tmp_path: Path) -> No
     plain = record(tmp_path, "occl", "mae_vz", 0, predicted(0).frame)
     records = read_report(tmp_path)
     assert [run.overrides for run in records.runs] == [None, "optimizer.lr=0.5 +optimizer.foreach=true"]
-    chosen = records.at_defaults("small", "occl", "mae_vz")
-    assert list(chosen) == [0]
-    assert chosen[0].folder.path == plain.path
     status_of(other, overrides=[])
     status_of(plain, overrides=["trainer.threads=1", "logger=none"])  # settings of the computation
     overrides = [run.overrides for run in read_report(tmp_path).runs]
@@ -79,7 +77,7 @@ def test_a_folder_with_another_name_enters_no_table(tmp_path: Path, leaf: str) -
     folder = record(tmp_path, "occl", "mae_vz", 0, predicted(0).frame)
     folder.path.rename(folder.path.with_name(leaf))
     assert only(tmp_path).state == "unreadable"
-    assert read_report(tmp_path).at_defaults("small", "occl", "mae_vz") == {}
+    assert read_report(tmp_path).means.empty
 
 
 def test_a_run_is_measured_again_where_it_has_changed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,7 +18,7 @@ from phd_exp.cli import report
 from phd_exp.records.choices import RunName
 from phd_exp.records.runs import RunFolder, RunStatus, find_runs
 from phd_exp.reports.files import all_tables
-from phd_exp.reports.runs import read_report
+from phd_exp.reports.report import read_report
 from phd_exp.reports.site import build
 
 COORDINATES = ("x", "y", "z")

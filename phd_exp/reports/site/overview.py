@@ -1,12 +1,11 @@
 """Charts of all runs together, from the charts of each. The script gives the first runs a colour and a label."""
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 from phd_exp.records.searches import Search
-from phd_exp.reports.charts import Chart, Trace, axis, bars, identity, line, square
-from phd_exp.reports.quantities import METRICS
+from phd_exp.reports.charts import Chart, Trace, axis, bar_chart, bars, chart, identity, line, square
 from phd_exp.reports.runs import Run
 
 CALIBRATION = ("depth_calibration", "projected_calibration", "coverage", "depth_pit")
@@ -60,21 +59,8 @@ def _overlaid(runs: Sequence[Drawn], section: str, key: str, role: str) -> Chart
         ends = min(x[0] for x in diagonals), max(x[1] for x in diagonals)
         traces.insert(0, identity(*ends, "calibrated"))
         layout = square(layout, *ends)
-    title = shown[0][1].title
-    label = f"{title}, {len(shown)} runs. {_in_words(traces, key)}"
-    return Chart(title, label, traces, layout)
-
-
-def _in_words(traces: Iterable[Trace], key: str) -> str:
-    """The last value of each run."""
-    metric = METRICS.get(key.removeprefix("learning_"))
-    ends = {
-        trace["text"]: known[-1]
-        for trace in traces
-        if "text" in trace and (known := [y for y in trace["y"] if y is not None])
-    }
-    texts = (f"{name} {metric.text(value) if metric else f'{value:.3g}'}" for name, value in ends.items())
-    return f"At the end: {', '.join(texts)}."
+    made = chart(shown[0][1].title, traces, layout["xaxis"], layout["yaxis"])
+    return replace(made, label=f"{made.label} {len(shown)} runs.")
 
 
 def _with_role(chart: Chart, role: str) -> list[Trace]:
@@ -99,17 +85,12 @@ def search_charts(search: Search) -> dict[str, Chart]:
     numbers = [trial.number + 1 for _, trial in search.finished]
     so_far = [min(values[: place + 1]) for place in range(len(values))]
     points = line("finished trials", numbers, values, 1) | {"mode": "markers"}
-    label = f"{search.objective} of {len(values)} finished trials; the best is {min(values):.4g}."
-    layout = {"xaxis": axis("trial"), "yaxis": axis(search.objective)}
-    history = Chart(f"{search.name}: history", label, [points, line("best so far", numbers, so_far, 2)], layout)
+    best = line("best so far", numbers, so_far, 2)
+    history = chart(f"{search.name}: history", [points, best], axis("trial"), axis(search.objective))
     charts = {f"history_{search.name}": history}
     if ranked := sorted(search.importances.items(), key=lambda item: -item[1]):
         keys, shares = zip(*ranked, strict=True)
-        label = ", ".join(f"{key} {share:.0%}" for key, share in ranked)
-        layout = {
-            "xaxis": axis("share of the variance of the score", rangemode="tozero"),
-            "yaxis": axis("") | {"type": "category", "autorange": "reversed"},
-        }
+        x = axis("share of the variance of the score", rangemode="tozero")
         trace = bars("importance", shares, keys, 1, shares, shares)
-        charts[f"importance_{search.name}"] = Chart(f"{search.name}: importance of keys", label, [trace], layout)
+        charts[f"importance_{search.name}"] = bar_chart(f"{search.name}: importance of keys", trace, x, "")
     return charts

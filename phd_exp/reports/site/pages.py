@@ -1,23 +1,22 @@
 """HTML of the pages; all text from files is escaped."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
+from phd_exp.evaluation.fusion import FusionScores
+from phd_exp.evaluation.tracks import TrackScores
 from phd_exp.records.processes import duration
-from phd_exp.reports.fusion import fusion_table, headline
 from phd_exp.reports.paper import PUBLISHED
 from phd_exp.reports.quantities import SCORES, mark
 from phd_exp.reports.runs import Run
 from phd_exp.reports.scene import scene_traces
 from phd_exp.reports.site.overview import Drawn, Groups, presets_of
-from phd_exp.reports.table import Table
-from phd_exp.reports.tracks import headline as headline_of_tracks
-from phd_exp.reports.tracks import tracks_table
+from phd_exp.reports.table import Table, file_stem
 
 _ENVIRONMENT = Environment(
     loader=FileSystemLoader(Path(__file__).parent / "templates"),
@@ -31,12 +30,7 @@ _ENVIRONMENT.filters |= {
     "duration": duration,
     "metres": lambda xyz: f"({', '.join(f'{one:.4g}' for one in xyz)}) m",
 }
-_ENVIRONMENT.globals |= {
-    "score": SCORES.__getitem__,
-    "headline": headline,
-    "headline_of_tracks": headline_of_tracks,
-    "mark": mark,
-}
+_ENVIRONMENT.globals |= {"score": SCORES.__getitem__, "mark": mark}
 HEADLINES = ("projected_error_mm", "depth_error_mm", "inside_90", "nll")
 
 
@@ -52,15 +46,33 @@ def overview_page(runs: Sequence[Run], tables: Sequence[Table], groups: Groups, 
         kinds=kinds,
         presets=presets_of(runs),
         groups=groups,
+        headlines={"fusion": _of_fusion, "tracks": _of_tracks},
         figures=figures,
         finished=sum(run.state == "finished" for run in runs),
         choices={"preset": sorted({run.preset for run in runs}), "data": sorted({run.data for run in runs})},
     )
 
 
-def run_page(drawn: Drawn, several: bool) -> str:
-    """The page of one run."""
+def _of_fusion(scores: FusionScores) -> str:
+    """The depth error with one camera and with all, in words."""
+    one, every = (
+        SCORES["depth_error_mm"].text(scores.band("depth_error_mm", "mode", k).value) for k in (1, scores.views)
+    )
+    return f"depth error {one} mm with one camera, {every} mm with {scores.views}"
+
+
+def _of_tracks(scores: Mapping[str, TrackScores]) -> str:
+    """The depth error of single frames and of the path, in words."""
+    shortest = min(scores.values(), key=lambda each: (each.frames, each.cameras))
+    bands = (shortest.bands[f"depth_error_mm/{method}"].value for method in ("single", "slow"))
+    single, path = map(SCORES["depth_error_mm"].text, bands)
+    return f"depth error {single} mm in single frames, {path} mm on paths of {shortest.frames}"
+
+
+def run_page(drawn: Drawn, several: bool, tables: Sequence[Table]) -> str:
+    """The page of one run, with its own tables of several cameras and of paths."""
     run = drawn.run
+    own = {table.kind: table for table in tables for kind in ("fusion", "tracks") if table.stem == _stem(kind, run)}
     return _ENVIRONMENT.get_template("run.html").render(
         root="../",
         several=several,
@@ -70,9 +82,12 @@ def run_page(drawn: Drawn, several: bool) -> str:
         headlines=[row for key in HEADLINES for row in rows if row["key"] == key],
         environment=_environment(run),
         charts=drawn.charts,
-        fusion=fusion_table(run, run.measured.fusion) if run.measured.fusion else None,
-        tracks=tracks_table(run, run.measured.tracks) if run.measured.tracks else None,
+        own=own,
     )
+
+
+def _stem(kind: str, run: Run) -> str:
+    return file_stem(kind, run.preset, run.data, run.model, run.name)
 
 
 def _environment(run: Run) -> dict[str, str]:

@@ -11,7 +11,8 @@ import pytest
 
 from phd_exp.records.runs import RunFolder
 from phd_exp.reports.quantities import SCORES
-from phd_exp.reports.runs import Run, read_report
+from phd_exp.reports.report import read_report
+from phd_exp.reports.runs import Run
 from phd_exp.reports.site import build
 from phd_exp.reports.site.overview import presets_of
 from phd_exp.reports.site.pages import overview_page
