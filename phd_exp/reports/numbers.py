@@ -156,8 +156,10 @@ def numbers_of(runs: Sequence[Run], searches: Sequence[Search] = ()) -> pd.DataF
     rows = [(run.path, *line) for run in runs for line in lines_of(run)]
     for search in searches:
         rows += [
-            (f"search/{one['search']}/{one['trial']}", one["overrides"], "held-out", one_line(search.objective))
-            + (one["state"], one["value"], math.nan, math.nan, 1)
+            (
+                *(f"search/{one['search']}/{one['trial']}", one["overrides"], "held-out"),
+                *(one_line(search.objective), one["state"], one["value"], math.nan, math.nan, 1),
+            )
             for one in trials_of(search)
         ]
     return pd.DataFrame(rows, columns=list(COLUMNS))

@@ -20,7 +20,7 @@ from phd_exp.geometry import Camera, Projected
 from phd_exp.models.backbones import PooledFeatures
 from phd_exp.models.heads import DistributionHead
 from phd_exp.models.regressor import FocalLengthInput, Regressor
-from phd_exp.reports.heads_table import BREAKS
+from phd_exp.reports.kinds import BREAKS
 from tests.support.densities import F_RANGE, HEADS, MIDDLE_F, S, in_view, predicted, raw_numbers
 from tests.support.heads import DEPTH
 
