@@ -31,6 +31,11 @@ COLUMNS = ("run", "subject", "split", "quantity", "method", "value", "low", "hig
   interval, `..., exact` the value of exact densities, `..., minus X` the paired difference to X.
 """
 AS_TRAINED, RECALIBRATED, CALIBRATED, EXACT = "as trained", "recalibrated", ", calibrated", ", exact"
+FACTS = (
+    *("path", "preset", "data", "model", "run", "digest", "words", "state", "detail", "camera", "images", "command"),
+    *("git_commit", "machine", "seed"),
+)
+"""What tables need to know of a run besides its numbers; all texts are printable, `words` are its overrides."""
 SAME = ("preset", "data", "model", "digest", "words", "subject", "split", "quantity", "method")
 Line = tuple[Any, ...]
 
@@ -105,18 +110,25 @@ def _of_samples(mean: SampleMean) -> tuple[float, float, float]:
     return mean.value, mean.value - half, mean.value + half
 
 
-def facts_of(run: Run) -> dict[str, Any]:
-    """What tables need to know of a run besides its numbers; all texts are printable, `words` are its overrides."""
+def facts_of(run: Run) -> tuple[Any, ...]:
+    """The `FACTS` of a run."""
     status = run.status
-    texts = {
-        "path": run.path, "preset": run.preset, "data": run.data, "model": run.model, "run": run.name,
-        "digest": run.digest, "words": run.overrides or "", "state": run.state, "detail": run.detail,
-        "camera": run.config.get("camera.focal_length", ""), "images": run.measured.images,
-        "command": command_of(run) if status else "", "git_commit": (status and status.git_commit) or "",
-        "machine": (status and status.machine) or "",
-    }  # fmt: skip
-    seed = None if run.seed is None else int(run.seed)
-    return {name: one_line(text) for name, text in texts.items()} | {"seed": seed}
+    texts = (
+        *(
+            run.path,
+            run.preset,
+            run.data,
+            run.model,
+            run.name,
+            run.digest,
+            run.overrides or "",
+            run.state,
+            run.detail,
+        ),
+        *(run.config.get("camera.focal_length", ""), run.measured.images, command_of(run) if status else ""),
+        *((status.git_commit or "", status.machine or "") if status else ("", "")),
+    )
+    return *map(one_line, texts), None if run.seed is None else int(run.seed)
 
 
 def command_of(run: Run) -> str:

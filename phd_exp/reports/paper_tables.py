@@ -53,7 +53,7 @@ Cell = dict[str, Any]
 def paper_tables(report: Report) -> list[Table]:
     """Both tables in both readings, for every preset that has any of a table's runs."""
     facts = report.facts
-    plain = facts[facts["seed"].notna() & (facts.get("words", "") == "")]
+    plain = facts[facts["seed"].notna() & (facts["words"] == "")]
     errors = [f"{quantity}_error_mm" for quantity in DIGITS]
     known = report.select(split="test", quantity=errors, method=[*COLUMNS, "eight views"])
     known = known[known["seed"].notna() & (known["words"] == "")]

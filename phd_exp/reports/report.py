@@ -15,6 +15,7 @@ from phd_exp.reports.ensembles import ensemble_scores
 from phd_exp.reports.measured import Notes
 from phd_exp.reports.numbers import (
     AS_TRAINED,
+    FACTS,
     as_long,
     differences,
     facts_of,
@@ -47,10 +48,8 @@ class Report:
 
     @cached_property
     def facts(self) -> pd.DataFrame:
-        """A row for each run, as of `facts_of`."""
-        columns = list(facts_of(self.runs[0])) if self.runs else ["path", "preset", "seed"]
-        facts = pd.DataFrame([facts_of(run) for run in self.runs], columns=columns)
-        return facts.astype({"seed": "Int64"})
+        """A row for each run, with the columns `FACTS`."""
+        return pd.DataFrame([facts_of(run) for run in self.runs], columns=list(FACTS)).astype({"seed": "Int64"})
 
     @cached_property
     def presets(self) -> list[str]:
