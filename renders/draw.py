@@ -11,13 +11,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import hydra
 import numpy as np
 from matplotlib.figure import Figure
 from PIL import Image, ImageDraw, ImageFont
 
-from phd_exp.cli import conf_folder
-from phd_exp.cli.jobs import plain
+from phd_exp.cli.jobs import composed
 from phd_exp.config import check_render
 from phd_exp.distributions.level_curves import LevelCurves
 from phd_exp.evaluation.parquet import read_table
@@ -180,9 +178,7 @@ def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
 
 
 def _spec(variant: str) -> DatasetSpec:
-    with hydra.initialize_config_dir(str(conf_folder()), version_base="1.3"):
-        config = hydra.compose("render", [f"data={variant}"])
-    return check_render(plain(config)).data.spec
+    return check_render(composed([f"data={variant}"], config_name="render")).data.spec
 
 
 if __name__ == "__main__":

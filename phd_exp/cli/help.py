@@ -1,8 +1,12 @@
-"""What `--help` prints, read from the files under conf/."""
+"""What `--help` prints, read from the files under conf/ and from the arguments of the verbs."""
 
-from collections.abc import Iterable
+import re
+from collections.abc import Iterable, Iterator
+from importlib import import_module
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
-from phd_exp.cli import choices_of, conf_folder
+from phd_exp.cli import choices_of, conf_folder, prefix_of
 
 VERBS = {
     "train": "render missing data, train, measure and record a run (the default)",
@@ -24,6 +28,29 @@ OF_VERB = {
     "render": ("data", "preset"),
 }
 """The configuration groups that a verb uses; the other verbs use none."""
+LINE = re.compile(r"( *)(\w+):(?: +([^#]*?))?(?: *# *(.*))?")
+"""A line of YAML: indentation, key, value and comment."""
+OF_DATA = {
+    "data/default": "data: any rendered data set",
+    "data/object": "data=object: further keys, and other defaults than above",
+}
+FILES = {
+    "train": {
+        "config": "",
+        "trainer/auto": "trainer",
+        "camera/known": "camera",
+        "optimizer/adam": "optimizer=adam",
+        "optimizer/muon": "optimizer=muon",
+        "recipe/paper": "recipe=paper",
+        **OF_DATA,
+        "data/folder": "data=folder",
+    },
+    "render": {"render": "", **OF_DATA},
+}
+"""Verb -> the files of conf/ that explain its keys, with their headings."""
+NAMES = {int: "int", float: "float", bool: "bool", NoneType: "null", tuple: "list", dict: "section"}
+Key = tuple[str, str, str, str]
+"""Name, type, default and description."""
 COMPLETION = 'eval "$(phd-exp -sc install=bash)"'
 EXAMPLES = {
     "train": [
@@ -98,8 +125,6 @@ def text_of(verb: str | None) -> str:
     words, groups = "SPACE.yaml [key=value ...]" if verb == "search" else "[key=value ...]", ""
     if verb in OF_VERB:
         words, groups = f"[-m] [group=choice ...] {words}", f"\n\ngroups\n{_choices(OF_VERB[verb])}"
-    from phd_exp.cli.keys import keys_of  # pydantic, which the help of the programme does without
-
     keys = "".join(
         f"\n{heading}".rstrip()
         + "".join(f"\n  {key}  {kind}, {value}\n      {text}" for key, kind, value, text in keys)
@@ -108,6 +133,66 @@ def text_of(verb: str | None) -> str:
     examples = "".join(f"\n  {line}" for line in EXAMPLES[verb])
     usage = f"usage: python -m phd_exp {verb} {words}\n\n{VERBS[verb]}"
     return f"{usage}{groups}\n\nkeys: type, default{keys}\n\nexamples{examples}"
+
+
+def keys_of(verb: str) -> dict[str, list[Key]]:
+    """Heading -> the keys of a verb, except the arguments of most classes that its groups choose."""
+    if verb in FILES:
+        return {heading: list(_in_file(file, verb)) for file, heading in FILES[verb].items()}
+    fields = getattr(import_module(f"phd_exp.cli.{verb}"), f"{verb.title()}Arguments").model_fields
+    found = []
+    for name, field in fields.items():
+        default = "required" if field.is_required() else str(field.default).lower().replace("none", "null")
+        found.append((name, _type(field.annotation), default, " ".join((field.description or "").split())))
+    return {"": found}
+
+
+def _in_file(file: str, verb: str) -> Iterator[Key]:
+    """The keys in a file of conf/ that have a comment."""
+    from phd_exp.config import RenderConfig, RunConfig  # pydantic, which the help of the programme does without
+
+    content = (conf_folder() / f"{file}.yaml").read_text()
+    group = file.rpartition("/")[0]
+    prefix, types = prefix_of(group, content), _types(RunConfig if verb == "train" else RenderConfig)
+    of_presets = (conf_folder() / "preset/paper.yaml").read_text()
+    sections: list[str] = []
+    for text in content.splitlines():
+        if not (found := LINE.fullmatch(text)):
+            continue
+        depth = len(found[1]) // 2
+        sections = [*sections[:depth], found[2]]
+        name, value, comment = prefix + ".".join(sections), found[3], found[4]
+        kind = types.get(name)
+        if group == "optimizer":  # its class has no model
+            kind = "bool" if value == "true" else "float"
+        if value and comment and kind:
+            unset = "set by preset" if f"{found[2]}:" in of_presets else "required"
+            yield name, kind, {"???": unset, "{}": "empty"}.get(value, value), comment
+
+
+def _types(annotation: Any, name: str = "") -> dict[str, str]:
+    """Dotted key below a model -> its type."""
+    from phd_exp.records.errors import keys_of_section
+
+    found = {name: _type(annotation)}
+    if hasattr(annotation, "model_fields"):
+        for key, part in keys_of_section(annotation).items():
+            found |= _types(part, f"{name}.{key}".lstrip("."))
+    for part in get_args(annotation):
+        if not isinstance(part, str):
+            found |= {key: kind for key, kind in _types(part, name).items() if key != name}
+    return found
+
+
+def _type(annotation: Any) -> str:
+    origin, parts = get_origin(annotation), get_args(annotation)
+    if origin is Annotated:
+        return _type(parts[0])
+    if origin is Literal:
+        return "|".join(map(str, parts))
+    if origin in (Union, UnionType):
+        return " or ".join(map(_type, parts))
+    return NAMES.get(origin or annotation, "text")
 
 
 def _choices(groups: Iterable[str]) -> str:

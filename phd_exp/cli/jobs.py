@@ -4,30 +4,31 @@ import os
 import shlex
 import sys
 import uuid
-from collections.abc import Callable
+from argparse import ArgumentParser
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NoReturn
 
 import hydra
-from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from phd_exp.cli import conf_folder
+from phd_exp.cli import conf_folder, words
 from phd_exp.cli.frame import Ending, Stopped, ending_with, failure, print_errors, stopping_on_signals
-from phd_exp.cli.paths import quoted
-from phd_exp.cli.words import REFUSED, SHARED, explain, require_overrides
+from phd_exp.cli.words import REFUSED, SHARED, explain, in_conf, parsed
 from phd_exp.records.errors import ConfigError, RunError
 from phd_exp.records.processes import usable_cores
 
 OMP = "OMP_NUM_THREADS"
 NO_SCORE = "the sweeper receives no score: only trainings with held-out samples have one; set data.n_held_out above 0"
 THIS_PROCESS = uuid.uuid4().hex  # names this process: another process that imports this module has another value
+FLAGS = ("--multirun -m", "--run -r", "--resolve", "--hydra-help", "--shell-completion -sc")
+WITH_VALUES = ("--package -p", "--config-path -cp", "--config-name -cn", "--config-dir -cd", "--cfg -c")
+"""Options of Hydra, long and short."""
 
 
 @dataclass(frozen=True)
@@ -81,8 +82,8 @@ class Job:
             if at_home:
                 raise
             return failure(stop)
-        except (ConfigError, OmegaConfBaseException) as error:  # the latter: an interpolation of an unknown key
-            return refusal(error)
+        except OmegaConfBaseException as error:  # an interpolation of an unknown key
+            return failure(explain(error))
         except Exception as error:
             return failure(error)
 
@@ -95,58 +96,53 @@ class Job:
         if composed.mode == RunMode.MULTIRUN:
             print(f"job {composed.job.num + 1}/{self.n_jobs}: {' '.join(overrides)}", flush=True)
         elif experiment := composed.runtime.choices.get("experiment"):
-            words = shlex.join(map(str, overrides))
-            raise ConfigError(f"experiment={experiment}: names several runs; write -m before it: -m {words}")
+            command = shlex.join(map(str, overrides))
+            raise ConfigError(f"experiment={experiment}: names several runs; write -m before it: -m {command}")
         return self.task(plain(config), overrides, self.cores or usable_cores())
-
-
-def refusal(error: Exception, config_name: str = "config") -> Ending:
-    """The ending of a job whose configuration is wrong; `error` is ours or one of `REFUSED`."""
-    refused = error if isinstance(error, ConfigError) else ConfigError(explain(error, config_name))
-    return failure(refused)
 
 
 def plain(config: DictConfig) -> dict[str, Any]:
     """The configuration as plain containers: interpolations resolved, without missing values and `SHARED`."""
-    values = _without_missing(OmegaConf.to_container(config, resolve=True))
-    return {str(key): value for key, value in values.items() if key not in SHARED}
+
+    def without_missing(node: Any) -> Any:
+        if not isinstance(node, dict):
+            return node
+        return {str(key): without_missing(value) for key, value in node.items() if value != MISSING}
+
+    values = without_missing(OmegaConf.to_container(config, resolve=True))
+    return {key: value for key, value in values.items() if key not in SHARED}
 
 
-def _without_missing(node: Any) -> Any:
-    if not isinstance(node, dict):
-        return node
-    return {key: _without_missing(value) for key, value in node.items() if value != MISSING}
+def composed(
+    overrides: Iterable[str], config_dir: str | Path | None = None, config_name: str = "config"
+) -> dict[str, Any]:
+    """The configuration of one run, without Hydra's command line. Raises ConfigError for a bad override."""
+    search = [f"hydra.searchpath=[file://{Path(config_dir).absolute()}]"] if config_dir else []
+    try:
+        with in_conf():
+            return plain(hydra.compose(config_name, [*overrides, *search]))
+    except REFUSED as error:
+        raise explain(error, config_name) from None
 
 
-def launch(job: Job, words: list[str], config_name: str = "config") -> int:
+def launch(job: Job, line: list[str], config_name: str = "config") -> int:
     """Run a job through Hydra, once or (-m) for every combination; returns the exit status.
 
-    `words` follow the verb; they change the configuration in `conf/<config_name>.yaml`. Raises RunError if a launcher
-    fails.
+    `line` are the words after the verb; they change the configuration in `conf/<config_name>.yaml`. Raises RunError
+    if a launcher fails.
     """
     # Hydra would print errors over several lines, and exit
     os.environ["HYDRA_FULL_ERROR"] = "1"
     try:
-        sys.argv = [sys.argv[0], *_options_last(words)]
+        sys.argv = [sys.argv[0], *_options_last(line)]
         hydra.main(version_base="1.3", config_path=str(conf_folder()), config_name=config_name)(job)()
     except (*REFUSED, ConfigError) as error:
-        job.endings.append(refusal(error, config_name))
+        job.endings.append(failure(explain(error, config_name)))
         print_errors(job.endings[-1].lines)
     return max((ending.exit_status for ending in job.endings), default=0)
 
 
-def composed(overrides: list[str], config_dir: str | Path | None = None) -> dict[str, Any]:
-    """The configuration of one run, without Hydra's command line. Raises ConfigError for a bad override."""
-    require_overrides(overrides)
-    search = [f"hydra.searchpath=[file://{Path(config_dir).absolute()}]"] if config_dir else []
-    try:
-        with hydra.initialize_config_dir(str(conf_folder()), version_base="1.3"):
-            return plain(hydra.compose("config", [*overrides, *search]))
-    except REFUSED as error:
-        raise ConfigError(explain(error, "config")) from None
-
-
-def _options_last(words: list[str]) -> list[str]:
+def _options_last(line: list[str]) -> list[str]:
     """The words with paths quoted, and Hydra's options after the overrides; its parser wants these in one piece.
 
     Raises ConfigError instead of the parser's usage message of several lines.
@@ -155,12 +151,17 @@ def _options_last(words: list[str]) -> list[str]:
     def refuse(message: str) -> NoReturn:
         raise ConfigError(f"{message}; see `python -m phd_exp --help`")
 
-    parser = get_args_parser()
+    parser = ArgumentParser(add_help=False, allow_abbrev=False)
     parser.error = refuse  # type: ignore[method-assign]
-    arguments = parser.parse_intermixed_args(words)
-    options = [word for word in words if word not in arguments.overrides]
-    overrides = quoted(arguments.overrides, several=arguments.multirun)
-    require_overrides(overrides)
+    parser.add_argument("overrides", nargs="*")
+    parser.add_argument("--info", "-i", nargs="?")
+    for names in FLAGS:
+        parser.add_argument(*names.split(), action="store_true")
+    for names in WITH_VALUES:
+        parser.add_argument(*names.split(), choices=["job", "hydra", "all"] if "--cfg" in names else None)
+    arguments = parser.parse_intermixed_args(line)
+    options = [word for word in line if word not in arguments.overrides]
+    overrides = words.overrides(arguments.overrides, several=arguments.multirun)
     if arguments.multirun and any(word.startswith("experiment=") for word in overrides):
         overrides = list(map(_for_jobs_alone, overrides))
     return [*overrides, *options]
@@ -171,11 +172,10 @@ def _for_jobs_alone(word: str) -> str:
 
     Before, Hydra composes a configuration without the choices of the experiment, which may lack the key.
     """
-    name, _, value = word.partition("=")
-    try:
-        overrides = OverridesParser.create().parse_overrides([word, f"{name}=choice({value})"])
-    except HydraException:  # of a deletion, no value, or a mistake, which is reported with the others
+    key, _, value = word.partition("=")
+    if "." not in key or key.startswith(("hydra.", "~")) or parsed(word).is_sweep_override():
         return word
-    before, after = overrides
-    is_of_job = "." in before.key_or_group and not before.is_hydra_override() and not before.is_sweep_override()
-    return str(after.input_line) if is_of_job else word
+    try:
+        return str(parsed(f"{key}=choice({value})").input_line)
+    except HydraException:  # no value, or a mistake, which is reported with the others
+        return word

@@ -6,30 +6,28 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 from warnings import catch_warnings
 
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import ChoiceSweep, IntervalSweep, RangeSweep
 from hydra.errors import HydraException
 from pydantic import BaseModel, ConfigDict, Field
 
+from phd_exp.cli import words
 from phd_exp.cli.arguments import Arguments
 from phd_exp.cli.frame import print_errors
 from phd_exp.cli.jobs import composed
-from phd_exp.cli.paths import quoted
-from phd_exp.cli.starts import checked_start
-from phd_exp.cli.train import run_name, task
+from phd_exp.cli.train import checked_start, run_name, task
 from phd_exp.config.targets import TrainingTarget, build
 from phd_exp.records.errors import ConfigError, RunError, UserError, gist
 from phd_exp.records.files import make_folder, read_plain, write_atomic
 from phd_exp.records.parsing import parse_yaml
 from phd_exp.records.processes import held, usable_cores
-from phd_exp.records.searches import RECORD, SEARCHES, Search, Trial, TrialState
+from phd_exp.records.searches import RECORD, SEARCHES, Search, Trial
 
 if TYPE_CHECKING:  # optional
     import optuna
 
-
 SEQUENCES = ("GridSampler", "QMCSampler")
 """Samplers whose seed determines the values of all trials; that of the others is increased with each trial."""
+STATES = {"COMPLETE": "finished", "PRUNED": "pruned", "FAIL": "failed", "RUNNING": "running"}
 
 
 class SearchArguments(Arguments):
@@ -52,21 +50,21 @@ class Space(BaseModel):
     pruner: TrainingTarget = {"_target_": "optuna.pruners.MedianPruner"}
 
 
-def main(words: list[str]) -> int:
+def main(line: list[str]) -> int:
     """Search; returns the exit status. The same command resumes an interrupted search."""
-    if not words or "=" in words[0]:
+    if not line or "=" in line[0]:
         raise ConfigError("search: expected SPACE.yaml first; see `python -m phd_exp search --help`")
     if find_spec("optuna") is None:
         raise ConfigError("search needs Optuna: `pip install 'phd_exp[search]'`")
-    file, keys = Path(words[0]), SearchArguments.model_fields
-    ours = [word for word in words[1:] if word.partition("=")[0] in keys]
+    file, keys = Path(line[0]), SearchArguments.model_fields
+    ours = [word for word in line[1:] if word.partition("=")[0] in keys]
     arguments = SearchArguments.parsed("search", ours)
     try:
         space = Space.model_validate(parse_yaml(read_plain(file).decode()), context={"trust": None})
     except (OSError, ValueError) as error:
         raise ConfigError(f"{file}: {gist(error)}; expected `space`, as in docs/guides/search.md") from None
-    given = [*space.overrides, *(word for word in words[1:] if word not in ours)]
-    fixed = [*quoted(given), "evaluation.held_out=true"]
+    given = [*space.overrides, *(word for word in line[1:] if word not in ours)]
+    fixed = [*words.overrides(given), "evaluation.held_out=true"]
     config = checked_start(composed(fixed, arguments.config_dir), fixed)
     if config.data.n_held_out == 0:
         raise ConfigError("data.n_held_out: got 0; a search is judged by held-out samples, expected at least 1")
@@ -75,7 +73,7 @@ def main(words: list[str]) -> int:
     with held(folder / ".lock") as free:
         if not free:
             raise RunError(f"{folder}: another process works on this search; wait for it or stop it")
-        _Search(space, fixed, arguments.config_dir, folder).run(arguments.trials)
+        search(space, fixed, arguments.config_dir, folder, arguments.trials)
     return 0
 
 
@@ -91,7 +89,7 @@ def distributions(space: Mapping[str, Any]) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for key, text in space.items():
         try:
-            override = OverridesParser.create().parse_override(f"{key}={text}")
+            override = words.parsed(f"{key}={text}")
             value: Any = override.value()
             if isinstance(value, ChoiceSweep):
                 found[key] = CategoricalDistribution(list(override.sweep_string_iterator()))
@@ -109,102 +107,91 @@ def distributions(space: Mapping[str, Any]) -> dict[str, Any]:
     return found
 
 
-class _Search:
-    """A study of Optuna whose trials are runs."""
+def search(space: Space, fixed: list[str], config_dir: Path | None, folder: Path, trials: int) -> "optuna.Study":
+    """Run trials until there are as many; those that were interrupted are resumed first. Returns the study."""
+    import optuna
 
-    def __init__(self, space: Space, fixed: list[str], config_dir: Path | None, folder: Path) -> None:
-        import optuna
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    values = distributions(space.space)
+    storage = f"sqlite:///{folder.absolute() / 'study.db'}"
+    study = optuna.create_study(
+        storage=storage, study_name=folder.name, pruner=build(space.pruner), load_if_exists=True
+    )
+    asked = {"space": space.space, "overrides": fixed}
+    if (before := study.user_attrs.get("asked", asked)) != asked:
+        raise RunError(f"{folder}: holds a search of {before}; rename the file, or that folder")
+    study.set_user_attr("asked", asked)
+    running = study.get_trials(deepcopy=False, states=[optuna.trial.TrialState.RUNNING])
+    begun = [optuna.trial.Trial(study, trial._trial_id) for trial in running]
+    while begun or len(study.trials) < trials:
+        if begun:
+            trial = begun.pop()
+        else:  # its values follow from those of the trials before, also in a resumed search
+            sampler = dict(space.sampler)
+            if isinstance(sampler.get("seed"), int) and not sampler["_target_"].endswith(SEQUENCES):
+                sampler["seed"] += len(study.trials)
+            study.sampler = build(sampler)
+            trial = study.ask(values)
+        print(f"trial {trial.number + 1}/{trials}: ", end="")
+        run_trial(study, trial, fixed, config_dir)
+        write_record(study, folder)
+    record = write_record(study, folder)
+    best = record.best
+    if best is None:
+        raise RunError(f"{folder}: no trial has finished; each line above says why")
+    chosen = " ".join(f"{key}={value}" for key, value in best.overrides.items())
+    print(f"{folder}: best of {len(study.trials)} trials: {chosen}: {record.objective} {best.value:.4g}, {best.run}")
+    return study
 
-        optuna.logging.set_verbosity(optuna.logging.WARNING)
-        self.fixed, self.config_dir, self.folder = fixed, config_dir, folder
-        self.space = distributions(space.space)
-        self.study = optuna.create_study(
-            storage=f"sqlite:///{folder.absolute() / 'study.db'}",
-            study_name=folder.name,
-            pruner=build(space.pruner),
-            load_if_exists=True,
+
+def run_trial(study: "optuna.Study", trial: "optuna.Trial", fixed: list[str], config_dir: Path | None) -> None:
+    """Train the run of a trial, and tell the study its score, or that it was pruned or failed."""
+    from optuna.trial import TrialState
+
+    from phd_exp.training.pruning import Pruned, Pruning, held_out_score
+
+    own = [f"{key}={value}" for key, value in trial.params.items()]
+    print(" ".join(own), flush=True)
+    overrides = [*fixed, *own]
+    config = composed(overrides, config_dir)
+    checked = checked_start(config, overrides)
+    run = run_name(checked, overrides).folder(checked.runs)
+    trial.set_user_attr("run", str(run))
+    try:
+        task(config, overrides, usable_cores(), callbacks=[Pruning(trial)])
+        objective, value = held_out_score(run)
+        study.set_user_attr("objective", objective)
+        study.tell(trial, value)
+    except Pruned as pruned:
+        print(f"{run}: {pruned}", flush=True)
+        study.tell(trial, state=TrialState.PRUNED)
+    except UserError as error:
+        study.tell(trial, state=TrialState.FAIL)
+        if isinstance(error, ConfigError):
+            raise
+        print_errors(str(error).splitlines())
+
+
+def write_record(study: "optuna.Study", folder: Path) -> Search:
+    """Write all trials of a search, and the importance of each key, where a report finds them."""
+    from optuna.importance import PedAnovaImportanceEvaluator, get_param_importances
+
+    try:
+        with catch_warnings(action="ignore"):  # of too few trials
+            importances = get_param_importances(study, evaluator=PedAnovaImportanceEvaluator())
+    except (ValueError, RuntimeError):  # no finished trial, or all alike
+        importances = {}
+    trials = [
+        Trial(
+            number=trial.number,
+            state=STATES[trial.state.name],  # type: ignore[arg-type]
+            overrides={key: str(value) for key, value in trial.params.items()},
+            run=trial.user_attrs.get("run", ""),
+            value=trial.value,
         )
-        self.sampler = space.sampler
-        asked = {"space": space.space, "overrides": fixed}
-        if self.study.user_attrs.get("asked", asked) != asked:
-            raise RunError(
-                f"{folder}: holds a search of {self.study.user_attrs['asked']}; rename the file, or that folder"
-            )
-        self.study.set_user_attr("asked", asked)
-
-    def run(self, trials: int) -> None:
-        """Run trials until there are as many; those that were interrupted are resumed first."""
-        import optuna
-
-        running = self.study.get_trials(deepcopy=False, states=[optuna.trial.TrialState.RUNNING])
-        begun = [optuna.trial.Trial(self.study, trial._trial_id) for trial in running]
-        while begun or len(self.study.trials) < trials:
-            trial = begun.pop() if begun else self._ask()
-            self._run_trial(trial, trials)
-            self._write()
-        search = self._write()
-        best = search.best
-        if best is None:
-            raise RunError(f"{self.folder}: no trial has finished; each line above says why")
-        words = " ".join(f"{key}={value}" for key, value in best.overrides.items())
-        score = f"{search.objective} {best.value:.4g}"
-        print(f"{self.folder}: best of {len(self.study.trials)} trials: {words}: {score}, {best.run}")
-
-    def _ask(self) -> "optuna.Trial":
-        """The next trial; its values follow from those of the trials before, also in a resumed search."""
-        sampler, number = dict(self.sampler), len(self.study.trials)
-        if isinstance(sampler.get("seed"), int) and not sampler["_target_"].endswith(SEQUENCES):
-            sampler["seed"] += number
-        self.study.sampler = build(sampler)
-        return self.study.ask(self.space)
-
-    def _run_trial(self, trial: "optuna.Trial", trials: int) -> None:
-        import optuna
-
-        from phd_exp.training.pruning import Pruned, Pruning, held_out_score
-
-        own = [f"{key}={value}" for key, value in trial.params.items()]
-        overrides = [*self.fixed, *own]
-        print(f"trial {trial.number + 1}/{trials}: {' '.join(own)}", flush=True)
-        config = composed(overrides, self.config_dir)
-        checked = checked_start(config, overrides)
-        run = run_name(checked, overrides).folder(checked.runs)
-        trial.set_user_attr("run", str(run))
-        try:
-            task(config, overrides, usable_cores(), callbacks=[Pruning(trial)])
-            objective, value = held_out_score(run)
-            self.study.set_user_attr("objective", objective)
-            self.study.tell(trial, value)
-        except Pruned as pruned:
-            print(f"{run}: {pruned}", flush=True)
-            self.study.tell(trial, state=optuna.trial.TrialState.PRUNED)
-        except UserError as error:
-            self.study.tell(trial, state=optuna.trial.TrialState.FAIL)
-            if isinstance(error, ConfigError):
-                raise
-            print_errors(str(error).splitlines())
-
-    def _write(self) -> Search:
-        """Write the record of the search."""
-        from optuna.importance import PedAnovaImportanceEvaluator, get_param_importances
-
-        try:
-            with catch_warnings(action="ignore"):  # of too few trials
-                importances = get_param_importances(self.study, evaluator=PedAnovaImportanceEvaluator())
-        except (ValueError, RuntimeError):  # no finished trial, or all alike
-            importances = {}
-        states: dict[str, TrialState] = {"COMPLETE": "finished", "PRUNED": "pruned", "FAIL": "failed"}
-        trials = [
-            Trial(
-                number=trial.number,
-                state=states.get(trial.state.name, "running"),
-                overrides={key: str(value) for key, value in trial.params.items()},
-                run=trial.user_attrs.get("run", ""),
-                value=trial.value,
-            )
-            for trial in self.study.trials
-        ]
-        objective = self.study.user_attrs.get("objective", "held_out/nll")
-        search = Search(name=self.folder.name, objective=objective, trials=trials, importances=importances)
-        write_atomic(self.folder / RECORD, search.model_dump_json(indent=2) + "\n")
-        return search
+        for trial in study.trials
+    ]
+    objective = study.user_attrs.get("objective", "held_out/nll")
+    record = Search(name=folder.name, objective=objective, trials=trials, importances=importances)
+    write_atomic(folder / RECORD, record.model_dump_json(indent=2) + "\n")
+    return record

@@ -3,7 +3,6 @@
 Hydra calls it through its plugin `hydra_plugins/phd_exp_sweeper.py`; `hydra/sweeper=NAME` selects another sweeper.
 """
 
-import itertools
 import json
 import math
 import os
@@ -11,21 +10,20 @@ import time
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from itertools import islice, product
 from typing import Any, NamedTuple
 
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Override, RangeSweep
+from hydra.core.override_parser.types import Override
 from hydra.core.plugins import Plugins
-from hydra.errors import HydraException
 from hydra.types import HydraContext, RunMode
 from omegaconf import DictConfig, open_dict
-from omegaconf.errors import OmegaConfBaseException
 
 from phd_exp.cli.frame import RESUMES, Ending, print_errors
 from phd_exp.cli.jobs import Job, plain
-from phd_exp.cli.words import explain
+from phd_exp.cli.words import REFUSED, explain
 from phd_exp.records.errors import ConfigError, RunError
 from phd_exp.records.processes import usable_cores
 
@@ -67,7 +65,7 @@ def _run(job: Job, master: DictConfig, jobs: list[Combination], context: HydraCo
         runner = Plugins.instance().instantiate_launcher(context, shared.end, master)
         returns = runner.launch([combination.overrides for combination in jobs], initial_job_idx=0)
         return [done.return_value for done in returns]
-    except (HydraException, OmegaConfBaseException, OSError):
+    except (*REFUSED, OSError):
         raise
     except Exception as error:  # joblib, Ray and submitit raise when a job's process dies
         found = [_recorded(job, combination) for combination in jobs]
@@ -95,8 +93,7 @@ def plan(words: list[str], config_name: str) -> tuple[DictConfig, list[Combinati
     The command line overrides an experiment. Combinations with equal configurations, which two experiments may share,
     are one job.
 
-    Raises HydraException or OmegaConfBaseException if a combination cannot be composed, ConfigError if there are no
-    combinations or too many.
+    Raises ConfigError if a combination cannot be composed, if there are no combinations or too many.
     """
     loader = GlobalHydra.instance().config_loader()
     jobs: dict[str, Combination] = {}
@@ -105,8 +102,9 @@ def plan(words: list[str], config_name: str) -> tuple[DictConfig, list[Combinati
         for overrides in _combinations(chosen, master, loader):
             try:
                 composed = loader.load_sweep_config(master, overrides)
-            except (HydraException, OmegaConfBaseException) as error:
-                raise _misfit(error, chosen, overrides, config_name) from error
+            except REFUSED as error:
+                GlobalHydra.instance().clear()  # the sweep ends here, and an explanation composes
+                raise ConfigError(f"{' '.join(overrides)}: {explain(error, config_name)}") from error
             with open_dict(composed):
                 del composed["hydra"]
             config = plain(composed)
@@ -114,15 +112,6 @@ def plan(words: list[str], config_name: str) -> tuple[DictConfig, list[Combinati
     if not jobs:
         raise ConfigError(f"{_given(words)}: not one combination; does a glob(...) match nothing?")
     return master, list(jobs.values())
-
-
-def _misfit(error: Exception, words: list[str], overrides: list[str], config_name: str) -> Exception:
-    """The error of a job that cannot be composed: that of an experiment names the job."""
-    if not any(word.startswith("experiment=") for word in words):
-        return error
-    GlobalHydra.instance().clear()  # the sweep ends here, and an explanation composes
-    own = " ".join(word for word in overrides if word not in words)
-    return ConfigError(f"{_given(words)}: its job {own} cannot be composed: {explain(error, config_name)}")
 
 
 def _one_experiment_each(words: list[str], loader: ConfigLoader) -> Iterator[list[str]]:
@@ -151,23 +140,18 @@ def _combinations(words: list[str], master: DictConfig, loader: ConfigLoader) ->
     if math.prod(map(len, values.values())) * len(each) > MOST_JOBS:
         raise ConfigError(f"{_given(words)}: more than {MOST_JOBS} jobs; expected fewer values")
     further = [[str(item.input_line) for item in items if item.key_or_group not in keys] for items in each]
-    return [[*combination, *together] for together in further for combination in itertools.product(*values.values())]
+    return [[*combination, *together] for together in further for combination in product(*values.values())]
 
 
 def _given(words: list[str]) -> str:
     return " ".join(word for word in words if not word.startswith("hydra."))
 
 
-def _values(item: Override) -> list[str]:
-    """The values of an override as text. Raises ConfigError for a range that is too long to expand."""
-    if not item.is_sweep_override():
-        return [item.get_value_element_as_str()]
-    value = item.value()
-    if isinstance(value, RangeSweep):
-        span = abs((value.stop or 0) - (value.start or 0))
-        if not span <= MOST_JOBS * abs(value.step):  # also for NaN
-            raise ConfigError(f"{item.input_line}: more than {MOST_JOBS} jobs; expected a shorter range")
-    return list(item.sweep_string_iterator())
+def _values(item: Override) -> Iterator[str]:
+    """The values of an override as text, of a range without end the first ones."""
+    if item.is_sweep_override():
+        return islice(item.sweep_string_iterator(), MOST_JOBS + 1)
+    return iter([item.get_value_element_as_str()])
 
 
 def cores_a_job(launcher: Mapping[str, Any], jobs: int) -> int | None:
@@ -188,7 +172,7 @@ def cores_a_job(launcher: Mapping[str, Any], jobs: int) -> int | None:
 
 
 def _print_outcome(job: Job, jobs: list[Combination], endings: list[Ending]) -> None:
-    """Print the outcome of each job with the overrides that distinguish it, then every error with all overrides."""
+    """Print how each job ended with the overrides that distinguish it, then every error with all overrides."""
     shared = set.intersection(*(set(one.overrides) for one in jobs))
     for one, ending in zip(jobs, endings, strict=True):
         own = [override for override in one.overrides if override not in shared]

@@ -8,13 +8,12 @@ from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 
+from phd_exp.cli import words
 from phd_exp.cli.jobs import Job, composed, launch
-from phd_exp.cli.paths import quoted
-from phd_exp.cli.starts import checked_start
-from phd_exp.config import RenderedConfig, RunConfig
+from phd_exp.config import RenderedConfig, RunConfig, check
+from phd_exp.config.targets import is_ours
 from phd_exp.records.choices import RunName, has_influence, setting
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.errors import ConfigError, RunError, shown
@@ -43,11 +42,15 @@ SUMMARY = {
     "test/nll": "NLL {}",
 }
 """The numbers of each run at the end of a sweep."""
+OF_NETWORK = ("backbone", "camera", "recipe.hidden", "recipe.exposure", "data.image_size")
+"""The sections and keys that describe a network and its inputs."""
+UNREADABLE = (KeyError, TypeError, AttributeError, OSError, RunError)
+"""The errors of a configuration that is not checked, and of a record that cannot be read."""
 
 
-def main(words: list[str]) -> int:
+def main(line: list[str]) -> int:
     """Train once, or (-m) for every combination; returns the exit status."""
-    return launch(Job(task, standing, numbers), words)
+    return launch(Job(task, standing, numbers), line)
 
 
 def task(config: dict[str, Any], overrides: list[str], cores: int, callbacks: Sequence[Any] = ()) -> float | None:
@@ -66,8 +69,8 @@ def task(config: dict[str, Any], overrides: list[str], cores: int, callbacks: Se
     if not skipped:
         require_possible(checked, folder)
         announce(checked, folder, overrides)
-    words = [str(item.input_line) for item in _unnamed(overrides)]
-    results = train(checked, folder, _draw(), cores, callbacks, words, render)
+    own = [str(item.input_line) for item in _unnamed(overrides)]
+    results = train(checked, folder, _draw(), cores, callbacks, own, render)
     record_further(folder, checked, render)
     print(f"{folder.path}: {'finished already' if skipped else 'finished'}")
     for key in filter(results.__contains__, SHOWN):
@@ -85,10 +88,51 @@ def trained(overrides: Sequence[str], config_dir: str | Path | None) -> "Trained
         raise ConfigError(
             f"overrides: got {shown(overrides)}; expected a list of words, such as [{shown(overrides)}]"
         )
-    words = quoted(overrides)
-    config = composed(words, config_dir)
-    task(config, words, usable_cores())
-    return TrainedRun(run_name(checked_start(config, words), words).folder(Path(config["runs"])))
+    own = words.overrides(overrides)
+    config = composed(own, config_dir)
+    task(config, own, usable_cores())
+    return TrainedRun(run_name(checked_start(config, own), own).folder(Path(config["runs"])))
+
+
+def checked_start(config: dict[str, Any], overrides: list[str]) -> RunConfig:
+    """The checked configuration of a training, with the network of the run that it starts from (`init=`), if any.
+
+    What the command line names stays. Raises ConfigError if the configuration is wrong, if that run is not finished,
+    or if its network is not of this project: such a network is only built if the command line names it.
+    """
+    place = config.get("init")  # the configuration alone may have larger images than it renders: not checked before
+    if not place or not isinstance(place, str):
+        return check(config)
+    start = RunFolder(Path(place))
+    if not start.is_finished():
+        raise ConfigError(f"init: got {place}; expected the folder of a finished run")
+    try:
+        changed = _with_network_of(start.config(), config, overrides)
+    except (KeyError, TypeError):
+        raise RunError(f"{start.config_file}: not the configuration of a run") from None
+    if changed["backbone"] is not config["backbone"] and not is_ours(changed["backbone"]):
+        raise ConfigError(
+            f"init: the network of {place} is not of this project; name it by backbone=CHOICE, or by "
+            "backbone._target_=MODULE.NAME"
+        )
+    return check(changed)
+
+
+def _with_network_of(recorded: dict[str, Any], config: dict[str, Any], overrides: list[str]) -> dict[str, Any]:
+    """A configuration with the recorded network, except for what the command line names."""
+    changed = dict(config)
+    named = [f"{words.parsed(word).key_or_group}." for word in overrides]
+    for name in OF_NETWORK:
+        section, _, key = name.partition(".")
+        if any(word.startswith(f"{name}.") for word in named):
+            continue
+        if not key:
+            changed[section] = recorded[section]
+            continue
+        changed[section] = {word: value for word, value in changed[section].items() if word != key}
+        if key in recorded[section]:  # older records lack a key whose default they had
+            changed[section][key] = recorded[section][key]
+    return changed
 
 
 def announce(checked: RunConfig, folder: RunFolder, overrides: list[str]) -> None:
@@ -110,9 +154,9 @@ def announce(checked: RunConfig, folder: RunFolder, overrides: list[str]) -> Non
     if equal := equal_run(checked, folder):
         print(f"  {equal.path} is finished, with an equal configuration: its command uses that run again", flush=True)
     if checked.preset == "paper" and not gpu:
-        words = shlex.join([*(word for word in overrides if not word.startswith("preset=")), "preset=small"])
+        shorter = shlex.join([*(word for word in overrides if not word.startswith("preset=")), "preset=small"])
         print("  the authors' protocol takes many hours without a GPU: an estimate follows the first batches")
-        print(f"  in about ten minutes: python -m phd_exp {words}", flush=True)
+        print(f"  in about ten minutes: python -m phd_exp {shorter}", flush=True)
 
 
 def rendered(data: RenderedConfig, fewer: str = FEWER, *, cores: int, shard: Shard | None = None) -> bool:
@@ -153,10 +197,6 @@ def numbers(config: dict[str, Any], overrides: list[str]) -> str:
         return ""
 
 
-UNREADABLE = (KeyError, TypeError, AttributeError, OSError, RunError)
-"""The errors of a configuration that is not checked, and of a record that cannot be read."""
-
-
 def _folder(config: dict[str, Any], overrides: list[str]) -> RunFolder:
     data = config["data"].get("variant") or config["data"]["name"]
     preset = setting(config["preset"], config["recipe"]["name"])
@@ -181,8 +221,7 @@ def _hashed(overrides: list[str]) -> tuple[str, ...]:
 
 def _unnamed(overrides: list[str]) -> list[Override]:
     """The overrides without a place of their own in a run's name."""
-    parsed = OverridesParser.create().parse_overrides(overrides)
-    return [item for item in parsed if item.key_or_group not in NAMED]
+    return [item for item in map(words.parsed, overrides) if item.key_or_group not in NAMED]
 
 
 def _draw() -> Callable[[dict[str, Any], Path], None] | None:

@@ -25,15 +25,15 @@ def _chunk(kind: bytes, content: bytes) -> bytes:
     return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
 
 
-def declared_png(width: int, height: int) -> bytes:
-    """A head that promises so many pixels, and a few bytes of them."""
+def declared(width: int, height: int) -> bytes:
+    """A PNG whose head promises so many pixels, and a few bytes of them."""
     head = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
     parts = (_chunk(b"IHDR", head), _chunk(b"IDAT", zlib.compress(bytes(9))), _chunk(b"IEND", b""))
     return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
 
 
 def text_bomb() -> bytes:
-    """A picture of 1 x 1 whose compressed comment unfolds to 100 MB."""
+    """A picture of 8 x 8 whose compressed comment unfolds to 100 MB."""
     whole = saved(Image.new("RGB", (8, 8)))
     comment = _chunk(b"zTXt", b"Comment\0\0" + zlib.compress(bytes(100_000_000), 9))
     return whole[:33] + comment + whole[33:]
@@ -45,14 +45,8 @@ def turned() -> bytes:
     return saved(noise(8, 8, 3), "jpeg", exif=exif)
 
 
-def animated(kind: str) -> bytes:
-    return saved(noise(8, 8, 3), kind, save_all=True, append_images=[noise(8, 8, 3).rotate(90)])
-
-
-def damaged() -> bytes:
-    whole = bytearray(saved(noise(32, 32, 3)))
-    whole[200:260] = bytes(60)
-    return bytes(whole)
+def animated() -> bytes:
+    return saved(noise(8, 8, 3), "gif", save_all=True, append_images=[noise(8, 8, 3).rotate(90)])
 
 
 def pipe(file: Path) -> None:
@@ -66,4 +60,3 @@ def link(file: Path, target: Path | str) -> None:
 
 
 POSTSCRIPT = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 8 8\n%%EndComments\n(owned) (w) file closefile\nshowpage\n"
-SVG = b"<svg xmlns='http://www.w3.org/2000/svg'><script>alert(1)</script></svg>"

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import hydra
 import numpy as np
 import pytest
 import torch
@@ -14,9 +13,9 @@ import yaml
 from PIL import Image
 
 from phd_exp.__main__ import main
-from phd_exp.cli import conf_folder
+from phd_exp.cli.jobs import composed
 from phd_exp.records.dataset import SPLITS, DatasetFolder, Seal, sha256
-from phd_exp.records.runs import RunFolder, find_runs
+from phd_exp.records.runs import RunFolder
 from phd_exp.records.spec import DatasetSpec
 from tests.support.handmade import write_handmade
 from tests.support.untrained import NARROW, write_metadata
@@ -27,6 +26,11 @@ TRAIN = (
     "trainer.accelerator=cpu", *NARROW,
 )  # fmt: skip
 HANDMADE = ("preset=smoke", "data.variant=handmade", "data.sensor_size=64", "data.f_range=[400,600]")
+PREDICT = ("predict", "run=RUN", "folder=photos/test")
+ONE = ("predict", "run=RUN", "image=photos/test/0.png", "f=300")
+REPORT = ("report", "runs=runs")
+LEARN = (*TRAIN, "data.folder=photos")
+VERIFY = ("render", *HANDMADE, "verify=true", "rerender=0")
 
 
 @dataclass(frozen=True)
@@ -40,20 +44,16 @@ class Place:
         (path,) = self.root.glob("runs/smoke/folder/probabilistic/seed0-*")
         return RunFolder(path)
 
-    @property
-    def photo(self) -> Path:
-        return self.root / "photos/test/0.png"
-
-    @property
-    def metadata(self) -> Path:
-        return self.root / "photos/test/metadata.jsonl"
+    def named(self, word: str) -> str:
+        """A word in which RUN stands for the run, whose name holds a hash."""
+        return word.replace("RUN", str(self.run.path.relative_to(self.root)))
 
     def put(self, file: Path | str, content: bytes | str) -> None:
         """Write a file anew, whatever is there."""
         path = self.root / file
         path.parent.mkdir(parents=True, exist_ok=True)
         path.unlink(missing_ok=True)
-        path.write_bytes(content.encode() if isinstance(content, str) else content)
+        path.write_bytes(content.encode(errors="surrogateescape") if isinstance(content, str) else content)
 
     @property
     def handmade(self) -> DatasetFolder:
@@ -72,15 +72,8 @@ class Place:
         folder.write_manifest(folder.manifest.model_copy(update={"splits": seals}))
 
     def put_config(self, **changes: Any) -> None:
-        """Change what the run's configuration says; dots lead inside."""
-        config = self.run.config()
-        for path, value in changes.items():
-            *parents, leaf = path.split("__")
-            node = config
-            for parent in parents:
-                node = node[parent]
-            node[leaf] = value
-        self.put(self.run.config_file, yaml.safe_dump(config))
+        """Change sections of the run's configuration."""
+        self.put(self.run.config_file, yaml.safe_dump(self.run.config() | changes))
 
     def put_json(self, file: Path, **changes: Any) -> None:
         self.put(file, json.dumps(json.loads(file.read_text()) | changes))
@@ -108,21 +101,16 @@ def write_photos(folder: Path) -> None:
         write_metadata(folder / split, lines)
 
 
-def handmade_spec() -> DatasetSpec:
-    with hydra.initialize_config_dir(str(conf_folder()), version_base="1.3"):
-        data = hydra.compose("config", list(HANDMADE)).data
-    return DatasetSpec(**{key: value for key, value in data.items() if key in DatasetSpec.model_fields})
-
-
 def make(root: Path) -> None:
     """Everything sound; the run is trained for one epoch."""
     write_photos(root / "photos")
-    write_handmade(DatasetFolder(root / "renders/handmade"), handmade_spec(), dict.fromkeys(SPLITS, 2))
+    data = composed(HANDMADE)["data"]
+    spec = DatasetSpec(**{key: value for key, value in data.items() if key in DatasetSpec.model_fields})
+    write_handmade(DatasetFolder(root / "renders/handmade"), spec, dict.fromkeys(SPLITS, 2))
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(root)
         patch.setattr("sys.argv", ["phd_exp"])
-        assert main([*TRAIN, "data.folder=photos"]) == 0
-    assert len(find_runs(root / "runs")) == 1
+        assert main(list(LEARN)) == 0
 
 
 def copied(sound: Path, root: Path) -> Place:

@@ -10,18 +10,15 @@ import numpy as np
 import pytest
 import torch
 
-from phd_exp.cli import conf_folder
+from phd_exp.cli import choices_of
 from phd_exp.cli.train import run_name
 from phd_exp.config import check
 from phd_exp.data.cache import cached
 from phd_exp.records.runs import RunFolder
 from tests.bad_input import images
-from tests.bad_input.bad import LEARN, ONE, PREDICT, REPORT
-from tests.bad_input.place import Place, spoil_checkpoint
-from tests.bad_input.table import Trap, trap
+from tests.bad_input.place import LEARN, ONE, PREDICT, REPORT, Place, spoil_checkpoint
+from tests.bad_input.table import PHOTO, Trap, trap
 
-READY = sorted(file.stem for file in (conf_folder() / "callbacks").glob("*.yaml"))
-"""The callbacks that are ready to use."""
 OWN = """
 import os
 import lightning
@@ -45,8 +42,7 @@ class Keeping(lightning.Callback):
 
 @pytest.fixture
 def command(place: Place, phd_exp: Callable) -> Callable:
-    run = str(place.run.path.relative_to(place.root))
-    return lambda *words: phd_exp(*(word.replace("RUN", run) for word in words))
+    return lambda *words: phd_exp(*map(place.named, words))
 
 
 def claimed(state: dict[str, Any], decoy: str) -> dict[str, Any]:
@@ -62,7 +58,7 @@ def test_a_resumed_checkpoint_deletes_nothing_outside_its_run(
 ) -> None:
     """Lightning deletes what a checkpoint calls the best one before; the way out of the folder is hidden in it."""
     place.put("own.py", OWN)
-    kinds = (f"callbacks=[{','.join(READY)}]", "+callbacks.own._target_=own.Keeping", "logger=csv")
+    kinds = (f"callbacks=[{','.join(choices_of('callbacks'))}]", "+callbacks.own._target_=own.Keeping", "logger=csv")
     common = [word for word in LEARN if "n_held_out" not in word and "logger" not in word]
     words = [*common, "data.n_train=4", "data.n_held_out=2", "runs=strange", *kinds]
     assert command(*words).status == 0
@@ -105,7 +101,7 @@ def test_no_ghostscript_is_called(place: Place, command: Callable, monkeypatch: 
     place.put("bin/gs", f"#!/bin/sh\ntouch {place.root}/owned\n")
     (place.root / "bin/gs").chmod(stat.S_IRWXU)
     monkeypatch.setenv("PATH", f"{place.root}/bin:{os.environ['PATH']}")
-    place.put(place.photo, images.POSTSCRIPT)
+    place.put(PHOTO, images.POSTSCRIPT)
     assert command(*PREDICT).status == 1
     assert not (place.root / "owned").exists()
 
@@ -119,35 +115,24 @@ def kept(cache: Path) -> np.ndarray:
     return cached(cache / "images.npy", {"layout": 1}, (3, 2), range(3), fill, "decoding")
 
 
-@pytest.mark.parametrize("content", ["pickle", "array of another shape", "pipe", "text"])
-def test_a_cache_that_came_with_the_images_is_made_anew(tmp_path: Path, content: str) -> None:
+def test_a_cache_that_came_with_the_images_is_made_anew_and_not_written_through(tmp_path: Path) -> None:
     kept(tmp_path)
-    file = tmp_path / "images.npy"
-    if content == "pickle":
-        np.save(file, np.array([Trap(str(tmp_path / "owned"))], dtype=object), allow_pickle=True)
-    elif content == "array of another shape":
-        np.save(file, np.zeros((1, 2), dtype=np.uint8))
-    elif content == "pipe":
-        images.pipe(file)
-    else:
-        file.write_text("no array")
-    np.testing.assert_array_equal(kept(tmp_path), [[1, 1], [2, 2], [3, 3]])
+    file, diary = tmp_path / "images.npy", tmp_path / "diary"
+    np.save(file, np.array([Trap(str(tmp_path / "owned"))], dtype=object), allow_pickle=True)
+    diary.write_text("dear")
+    (tmp_path / "images.unfinished").symlink_to(diary)
+    for spoil in (lambda: None, lambda: np.save(file, np.zeros((1, 2), np.uint8)), lambda: images.pipe(file)):
+        spoil()
+        np.testing.assert_array_equal(kept(tmp_path), [[1, 1], [2, 2], [3, 3]])
     assert not (tmp_path / "owned").exists()
-
-
-def test_a_cache_that_leads_elsewhere_is_not_written_through(tmp_path: Path) -> None:
-    (tmp_path / "diary").write_text("dear")
-    (tmp_path / "cache").mkdir()
-    (tmp_path / "cache" / "images.unfinished").symlink_to(tmp_path / "diary")
-    kept(tmp_path / "cache")
-    assert (tmp_path / "diary").read_text() == "dear"
+    assert diary.read_text() == "dear"
 
 
 def test_no_variable_of_the_environment_is_read(
     place: Place, command: Callable, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("SECRET", "sesame-7391")
-    place.put_config(data__name="${oc.env:SECRET}")
+    place.put_config(data=place.run.config()["data"] | {"name": "${oc.env:SECRET}"})
     outcome = command(*ONE)
     assert outcome.status == 2
     assert "sesame-7391" not in outcome.err

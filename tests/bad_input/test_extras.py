@@ -10,9 +10,7 @@ from typing import Any
 
 import pytest
 
-from tests.bad_input.bad import LEARN, ONE
-from tests.bad_input.commands import space
-from tests.bad_input.place import HANDMADE, Place
+from tests.bad_input.place import HANDMADE, LEARN, ONE, Place
 
 PACKAGES = {
     "train": ("hydra", "omegaconf", "lightning", "wandb", "torchmetrics", "torchvision"),
@@ -84,11 +82,10 @@ def outcomes(place: Place) -> Callable[..., list[tuple[int, str, str]]]:
 
     In a new process, because this process has already imported some of these packages.
     """
-    run = str(place.run.path.relative_to(place.root))
-    space(place)
+    place.put("space.yaml", "space: {}\n")
 
     def outcomes(commands: Sequence[Sequence[str]], absent: Sequence[str]) -> list[tuple[int, str, str]]:
-        words = [[word.replace("RUN", run) for word in command] for command in commands]
+        words = [[*map(place.named, command)] for command in commands]
         code = [sys.executable, "-c", WITHOUT, json.dumps([words, absent])]
         answer = subprocess.run(code, capture_output=True, text=True, cwd=place.root)
         assert answer.returncode == 0, answer.stderr

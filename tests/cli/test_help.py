@@ -9,9 +9,8 @@ from collections.abc import Callable
 import pytest
 
 from phd_exp import __version__ as phd_exp_version
-from phd_exp.cli import conf_folder
-from phd_exp.cli.help import COMPLETION, EXAMPLES, OF_VERB, VERBS
-from phd_exp.cli.keys import keys_of
+from phd_exp.cli import choices_of, conf_folder, short_choices
+from phd_exp.cli.help import COMPLETION, EXAMPLES, OF_VERB, VERBS, keys_of
 
 
 def test_help_within_a_second_and_without_torch() -> None:
@@ -27,17 +26,15 @@ def test_help_within_a_second_and_without_torch() -> None:
     assert time.monotonic() - start < 1
 
 
-def test_help_lists_verbs_groups_and_choices(phd_exp: Callable) -> None:
+def test_help_lists_verbs_groups_and_choices_with_examples(phd_exp: Callable) -> None:
     outcome = phd_exp("--help")
     assert outcome.status == 0
-    groups = {path.name for path in conf_folder().iterdir() if path.is_dir()}
+    groups = {path.name for path in conf_folder().iterdir() if path.is_dir()} | {
+        group for group, *_ in short_choices()
+    }
     assert set(OF_VERB["train"]) == groups - {"hydra"}  # which selects the launcher and the sweeper
-    files = [file for group in OF_VERB["train"] for file in (conf_folder() / group).glob("*.yaml")]
-    for word in [*VERBS, *OF_VERB["train"], *(file.stem for file in files)]:
-        assert word in outcome.out
-
-
-def test_every_verb_has_help_with_examples(phd_exp: Callable) -> None:
+    choices = [choice for group in OF_VERB["train"] for choice in choices_of(group)]
+    assert all(word in outcome.out for word in [*VERBS, *OF_VERB["train"], *choices, COMPLETION])
     assert VERBS.keys() == EXAMPLES.keys() >= OF_VERB.keys()
     for verb in VERBS:
         outcome = phd_exp(verb, "--help")
@@ -50,24 +47,17 @@ def test_help_lists_every_key_once_for_each_choice(verb: str) -> None:
     found = {heading: {name: default for name, _, default, _ in keys} for heading, keys in keys_of(verb).items()}
     assert sum(map(len, found.values())) == sum(map(len, keys_of(verb).values()))
     assert all("???" not in default for keys in found.values() for default in keys.values())
-    everywhere, (rendered,) = found[""], (keys for heading, keys in found.items() if heading.startswith("data: "))
+    (rendered,) = (keys for heading, keys in found.items() if heading.startswith("data: "))
     assert {"data.variant", "data.root", "data.f_range"} <= rendered.keys()
     assert rendered["data.n_train"] == "set by preset"
     if verb == "train":
-        assert everywhere["seed"] == "0"
-        assert everywhere["evaluation.shifts"] == "empty"
+        assert (found[""]["seed"], found[""]["evaluation.shifts"]) == ("0", "empty")
         assert found["trainer"]["trainer.max_epochs"] == "set by preset"
-        assert {"data.name", "data.object", "data.n_train"} <= found["data=folder"].keys()
         assert found["data=folder"]["data.folder"] == "required"
         assert [found[f"optimizer={name}"]["optimizer.lr"] for name in ("adam", "muon")] == ["0.001", "0.002"]
-        assert found["camera"]["camera.f_error"] == "0"
-
-
-def test_help_explains_completion(phd_exp: Callable) -> None:
-    assert COMPLETION in phd_exp("--help").out
-    outcome = phd_exp("-sc", "install=bash")
-    assert outcome.status == 0
-    assert "complete -o nospace" in outcome.out
+        kinds = {name: kind for keys in keys_of(verb).values() for name, kind, *_ in keys}
+        assert [kinds[key] for key in ("seed", "data.f_range", "optimizer.fused")] == ["int", "list", "bool"]
+        assert kinds["trainer.accelerator"] == "auto|cpu|gpu"
 
 
 @pytest.mark.parametrize(
@@ -83,6 +73,7 @@ def test_help_explains_completion(phd_exp: Callable) -> None:
 def test_a_shell_completes_groups_choices_and_keys(
     phd_exp: Callable, monkeypatch: pytest.MonkeyPatch, line: str, offered: str
 ) -> None:
+    assert "complete -o nospace" in phd_exp("-sc", "install=bash").out
     monkeypatch.setenv("COMP_LINE", line)
     outcome = phd_exp("-sc", "query=bash")
     assert (outcome.status, outcome.out.strip(), outcome.err) == (0, offered, "")
@@ -94,9 +85,6 @@ def test_hydra_options_may_stand_between_overrides(phd_exp: Callable, verb: list
     words = ["data.n_test=7", "preset=smoke"]
     words[place:place] = ["--package", "data.n_test", "--cfg", "job"]
     assert phd_exp(*verb, *words).out.strip() == "7"
-
-
-def test_the_version_is_that_of_the_package(phd_exp: Callable) -> None:
     assert phd_exp("--version").out == f"phd_exp {phd_exp_version}\n"
 
 

@@ -7,7 +7,6 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import hydra
 import pytest
 from hydra.types import RunMode
 from omegaconf import OmegaConf
@@ -17,6 +16,7 @@ from phd_exp.cli import jobs as launched
 from phd_exp.cli.jobs import Job
 from phd_exp.cli.sweep import Combination, cores_a_job, plan
 from phd_exp.cli.train import numbers, run_name, standing
+from phd_exp.cli.words import in_conf
 from phd_exp.config import check
 from phd_exp.records.processes import usable_cores
 from phd_exp.records.runs import RunFolder
@@ -32,7 +32,7 @@ SUBMITIT = "hydra_plugins.hydra_submitit_launcher.submitit_launcher"
 @pytest.fixture
 def jobs() -> Iterator[Callable[..., list[Combination]]]:
     """The jobs that the words of a command line stand for."""
-    with hydra.initialize_config_dir(str(conf_folder()), version_base="1.3"):
+    with in_conf():
         yield lambda *words: plan(list(words), "config")[1]
 
 
@@ -75,7 +75,7 @@ def test_an_experiment_says_how_many_runs_it_has_and_changes_nothing_else(jobs: 
 
 
 def test_jobs_in_a_queue_come_back() -> None:
-    with hydra.initialize_config_dir(str(conf_folder()), version_base="1.3"):
+    with in_conf():
         master, _ = plan(["hydra/launcher=slurm", "hydra.launcher.partition=gpu"], "config")
     launcher = master.hydra.launcher
     assert launcher["_target_"].endswith("SlurmLauncher")

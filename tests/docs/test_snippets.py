@@ -9,15 +9,14 @@ from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 
-import hydra
 import pytest
 import yaml
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from phd_exp.cli import conf_folder
 from phd_exp.cli.help import EXAMPLES, OF_VERB, VERBS
-from phd_exp.cli.jobs import composed, plain
-from phd_exp.cli.starts import checked_start
+from phd_exp.cli.jobs import composed
+from phd_exp.cli.train import checked_start
 from phd_exp.config import check_render
 from tests.docs.pages import PAGES, ROOT, blocks, commands, name
 from tests.support.meshes import solid, write_mesh
@@ -91,8 +90,7 @@ def _single_runs(words: list[str]) -> list[tuple[str, ...]]:
 
 @cache  # many pages repeat a command
 def _check(verb: str, overrides: tuple[str, ...]) -> None:
-    with hydra.initialize_config_dir(str(conf_folder()), version_base="1.3"):
-        config = plain(hydra.compose("config" if verb == "train" else "render", list(overrides)))
+    config = composed(overrides, config_name="config" if verb == "train" else "render")
     if verb == "train":
         checked_start(config, list(overrides))
     else:

@@ -16,7 +16,7 @@ from tests.support.recorded import status_of
 
 optuna = pytest.importorskip("optuna", reason="needs `pip install 'phd_exp[search]'`")
 
-from phd_exp.cli.search import Space, _Search, distributions  # noqa: E402
+from phd_exp.cli import search as verb  # noqa: E402
 
 WORDS = ("space.yaml", "config_dir=my_conf", *QUICK[1:])
 SPACE = """
@@ -37,7 +37,7 @@ def search(own: Callable, phd_exp: Callable, tmp_path: Path) -> Callable:
 def test_values_are_those_of_hydras_sweeps() -> None:
     kinds = optuna.distributions
     space = {"a": "interval(0.5, 2)", "b": "tag(log, int(interval(1, 9)))", "c": "range(0, 10, step=5)"}
-    found = distributions(space | {"d": "choice(x, 3)"})
+    found = verb.distributions(space | {"d": "choice(x, 3)"})
     assert found == {
         "a": kinds.FloatDistribution(0.5, 2.0),
         "b": kinds.IntDistribution(1, 9, log=True),
@@ -49,7 +49,7 @@ def test_values_are_those_of_hydras_sweeps() -> None:
 @pytest.mark.parametrize("text", ["3", "interval(2, 1)", "glob(*)", "interval(0, 1", "range(3, 3)", [0.5, 2]])
 def test_other_values_are_refused(text: Any) -> None:
     with pytest.raises(ConfigError, match=r"^space\.a: got "):
-        distributions({"a": text})
+        verb.distributions({"a": text})
 
 
 @pytest.mark.filterwarnings("ignore::optuna.exceptions.ExperimentalWarning")
@@ -57,19 +57,18 @@ def test_other_values_are_refused(text: Any) -> None:
 def test_a_resumed_search_tries_the_values_of_an_uninterrupted_one(
     sampler: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    def tell(self: _Search, trial: Any, trials: int) -> None:
-        self.study.tell(trial, trial.params["a"])
+    def tell(study: optuna.Study, trial: optuna.Trial, fixed: list[str], config_dir: Path | None) -> None:
+        study.tell(trial, trial.params["a"])
 
     def searched(name: str, *parts: int) -> list[float]:
         (tmp_path / name).mkdir()
         for trials in parts:
-            found = _Search(space, [], None, tmp_path / name)
-            found.run(trials)
-        return [trial.params["a"] for trial in found.study.trials]
+            study = verb.search(space, [], None, tmp_path / name, trials)
+        return [trial.params["a"] for trial in study.trials]
 
-    monkeypatch.setattr(_Search, "_run_trial", tell)
+    monkeypatch.setattr(verb, "run_trial", tell)
     chosen = {"_target_": f"optuna.samplers.{sampler}", "seed": 0}
-    space = Space(space={"a": "interval(0, 1)"}, sampler=chosen, pruner={"_target_": "optuna.pruners.NopPruner"})
+    space = verb.Space(space={"a": "interval(0, 1)"}, sampler=chosen, pruner={"_target_": "optuna.pruners.NopPruner"})
     whole = searched("whole", 14)
     assert len(set(whole)) == 14
     assert searched("resumed", 3, 4, 12, 14) == whole

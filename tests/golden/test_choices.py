@@ -7,7 +7,8 @@ from typing import Any
 import pytest
 from lightning.pytorch.callbacks import LambdaCallback
 
-from phd_exp.cli import conf_folder
+from phd_exp.cli import choices_of
+from phd_exp.cli.help import OF_VERB
 from phd_exp.config import check
 from phd_exp.records.choices import flatten
 from phd_exp.records.runs import RunFolder
@@ -78,9 +79,9 @@ def test_losses_of_a_training(
 def test_each_choice_changes_the_same_values(golden: Callable, composed: Callable[..., dict[str, Any]]) -> None:
     """The whole configuration of the paper's protocol, and what each single choice of a group changes in it."""
     made = {"": (base := flatten(composed()))}
-    for file in sorted(conf_folder().glob("*/*.yaml")):
-        if (group := file.parent.name) not in ("hydra", "experiment"):  # of several runs
-            choice = f"{group}=[{file.stem}]" if group in ("callbacks", "shift") else f"{group}={file.stem}"
+    for group in sorted({*OF_VERB["train"]} - {"experiment"}):  # which is of several runs
+        for name in choices_of(group):
+            choice = f"{group}=[{name}]" if group in ("callbacks", "shift") else f"{group}={name}"
             found = flatten(composed(choice))
             gone = {key: "gone" for key in base if key not in found}
             made[choice] = {key: value for key, value in found.items() if base.get(key, ...) != value} | gone

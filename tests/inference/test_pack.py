@@ -1,6 +1,6 @@
 """Packed runs: equal predictions, equal bytes for equal runs, and a card that repeats the record.
 
-Archives of an attacker are in tests/bad_input/archives.py.
+Archives of an attacker are in tests/bad_input/table.py.
 """
 
 import gc
