@@ -2,6 +2,7 @@
 
 import os
 import re
+import sys
 from collections import defaultdict
 from collections.abc import Iterable
 
@@ -116,7 +117,7 @@ def explain(error: Exception, config_name: str = "config") -> ConfigError:
     if isinstance(error, ConfigError):
         return error
     text = " ".join(str(error).split())
-    if (found := re.search(r"Could not override '[+~]*([^']+)'", text)) and not found[1].startswith("hydra."):
+    if found := re.search(r"Could not override '[+~]*([^']+)'", text):
         return ConfigError(_unknown_key(found[1], config_name))
     if found := re.search(r"Could not (?:find|load) '([^']+)/([^']+)'", text):
         group, name = found.groups()
@@ -129,8 +130,9 @@ def _unknown_key(key: str, config_name: str) -> str:
     """The message about a key that the configuration lacks: a choice that has it, or the keys of its section."""
     if owners := (of_choices := _keys_of_choices()).get(key):
         return f"{key}: not a key of this choice, but of {' or '.join(owners)}; name that choice too"
+    is_hydra, launcher = key.startswith("hydra."), [word for word in sys.argv if word.startswith("hydra/")]
     with in_conf():
-        composed = hydra.compose(config_name)
+        composed = hydra.compose(config_name, launcher * is_hydra, return_hydra_config=is_hydra)
     config = {str(name): composed[name] for name in composed if name not in SHARED}
     top = sorted({*config, *OF_VERB["render" if config_name == "render" else "train"]})
     if key in top:

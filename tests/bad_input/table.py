@@ -23,6 +23,7 @@ TYPED = {
     "model=mae_log": "model=mae_log: no such choice, did you mean 'mae_logz'?; expected one of ",
     "data.folder=photos": "data.folder: not a key of this choice, but of data=folder; name that choice too",
     "trainer.gradient_clip_val=1": "a further argument of its class has a plus sign: +trainer.gradient_clip_val=VALUE",
+    "-m hydra/launcher=submitit_slurm hydra.launcher.partiton=x": "did you mean 'hydra.launcher.partition'?",
     "network.width=8": "network.width: set by presets and recipes; expected the key of the run",
     "model = mae_vz": "model: no KEY=VALUE, did you mean ",
     "data.n_train=[": "data.n_train=[: ",
