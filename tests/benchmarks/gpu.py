@@ -1,18 +1,12 @@
-"""Measurements on a GPU: images a second at `preset=paper`, which `make gpu` prints, and two whole runs.
+"""Images a second on a GPU at `preset=paper`, which `make gpu` prints.
 
 Each recipe is trained on noise in memory, first with its own data path, then with one batch repeated. The difference
-of both times is the wait for data. Prints a JSON line for each recipe.
-
-`--runs` trains the authors' protocol (`protocol`) or the speed record (`record`) from rendered images instead, as the
-command line does, and prints a JSON line for each: its seconds, with start and evaluation, and its results. The same
-command resumes an interrupted run. All of it runs on a CPU too, for a check of the script.
+of both times is the wait for data. Prints a JSON line for each recipe. It runs on a CPU too, for a check.
 """
 
 import argparse
 import itertools
 import json
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Iterable
@@ -28,7 +22,6 @@ from phd_exp.cli.jobs import composed
 from phd_exp.config import RunConfig, check
 from phd_exp.data.batches import Batch
 from phd_exp.data.datamodule import PositionData
-from phd_exp.evaluation.parquet import read_table
 from phd_exp.records.processes import machine
 from phd_exp.records.runs import RunFolder
 from phd_exp.training.build import build_augmentation, build_module
@@ -41,8 +34,6 @@ RECIPES = {
     "strong": ["recipe=strong"],
     "strong, robust": ["recipe=strong", "photometry=robust"],
 }
-RUNS = {"protocol": ["data.xy_range=0.5", "data.variant=central"], "record": ["-m", "experiment=speed"]}
-PRINTED = ("projected_error_mm", "depth_error_mm", "nll")  # means over the held-out and the test images
 WARM_UP = 10  # steps
 
 
@@ -109,32 +100,15 @@ def measured(overrides: list[str], steps: int) -> dict[str, Any]:
     return {"images_per_s": round(n / whole), "without_data": round(n / alone), "wait": round(1 - alone / whole, 3)}
 
 
-def trained(name: str, words: list[str], runs: Path) -> dict[str, Any]:
-    """The seconds and the results of a whole run in the folder `runs`/`name`."""
-    folder = runs / name
-    settings = [f"runs={folder}", "logger=none", "trainer.progress_bar=false", "data.image_format=webp"]
-    subprocess.run([sys.executable, "-m", "phd_exp", *RUNS[name], *settings, *words], check=True, stdout=sys.stderr)
-    (status_file,) = folder.rglob("status.json")
-    run = RunFolder(status_file.parent)
-    status, parts = run.status(), {"held_out": run.held_out, "test": run.predictions}
-    tables = {part: read_table(file) for part, file in parts.items() if file.exists()}
-    means = {f"{part}/{key}": round(table[key].mean(), 3) for part, table in tables.items() for key in PRINTED}
-    return {"seconds": round((status.ended - status.started).total_seconds())} | means
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--steps", type=int, default=100, help="training steps that are timed")
     parser.add_argument("--recipes", nargs="+", choices=list(RECIPES), default=list(RECIPES))
-    parser.add_argument("--runs", nargs="+", choices=list(RUNS), default=[], help="whole runs instead of recipes")
-    parser.add_argument("--folder", type=Path, default=Path("runs/gpu"), help="of the whole runs")
     parser.add_argument("overrides", nargs="*", help="of the configuration, such as data.image_size=64")
     arguments = parser.parse_intermixed_args()
     gpu = torch.cuda.get_device_name() if torch.cuda.is_available() else "no GPU"
     print(json.dumps({"machine": machine(), "gpu": gpu, "torch": torch.__version__}), flush=True)
-    for name in arguments.runs:
-        print(json.dumps({"run": name} | trained(name, arguments.overrides, arguments.folder)), flush=True)
-    for name in [] if arguments.runs else arguments.recipes:
+    for name in arguments.recipes:
         found = measured([*RECIPES[name], *arguments.overrides], arguments.steps)
         print(json.dumps({"recipe": name} | found), flush=True)
 

@@ -2,9 +2,8 @@
 
 `python loops.py LOOP FOLDER EPOCHS OVERRIDE...` alternates between both, epoch by epoch. For each epoch but the first
 it prints a JSON line: images a second of the programme and of the loop, and the share of evaluation and logging in
-the programme's epoch. LOOP is `bare`, on noise in memory, so that only training is measured, or `conventional`, on
-rendered images. With 0 EPOCHS it prints the peak memory in bytes after two steps: of the bare loop, or of the
-programme if LOOP is `programme`.
+the programme's epoch. LOOP is `bare`, and both train on noise in memory. With 0 EPOCHS it prints the peak memory in
+bytes after two steps: of the bare loop, or of the programme if LOOP is `programme`.
 """
 
 import copy
@@ -17,30 +16,22 @@ from typing import Any
 
 import torch
 from lightning import Callback
-from PIL import Image
 from torch import Tensor
-from torch.utils.data import DataLoader, Dataset
-from torchvision.transforms.functional import normalize, pil_to_tensor
 
 from phd_exp.cli.jobs import composed
 from phd_exp.config import RunConfig, check
 from phd_exp.data.batches import Batch
 from phd_exp.data.datamodule import PositionData
 from phd_exp.data.sources import Known, Part, Source
-from phd_exp.geometry.camera import Camera
 from phd_exp.geometry.charts import DepthScale
 from phd_exp.hardware import precision
-from phd_exp.metrics.errors import depth_error, projected_error
-from phd_exp.models.regressor import IMAGENET_MEAN, IMAGENET_STD
-from phd_exp.records.dataset import CELLS, DatasetFolder
+from phd_exp.records.dataset import CELLS
 from phd_exp.records.runs import RunFolder
-from phd_exp.training.build import build_data, build_module
+from phd_exp.training.build import build_module
 from phd_exp.training.module import PositionModule
 from phd_exp.training.recorder import Recorder
 from phd_exp.training.run import UNTRAINED
 from phd_exp.training.trainer import build_trainer
-
-WORKERS = 2
 
 
 class Noise(Source):
@@ -92,58 +83,10 @@ class Bare:
         return len(self.samples)
 
 
-class Pictures(Dataset[tuple[Tensor, Tensor, Tensor]]):
-    """(pixels, position, focal length) of the first samples of a folder; each image is decoded from its file."""
-
-    def __init__(self, folder: Path, labels: Batch) -> None:
-        self.files = sorted(folder.glob("*.png"))[: len(labels)]
-        self.labels, self.side = labels, int(labels.S)
-
-    def __len__(self) -> int:
-        return len(self.files)
-
-    def __getitem__(self, i: int) -> tuple[Tensor, Tensor, Tensor]:
-        picture = Image.open(self.files[i]).convert("RGB")
-        if picture.width != self.side:
-            picture = picture.resize((self.side, self.side), Image.Resampling.BOX)
-        pixels = normalize(pil_to_tensor(picture) / 255, IMAGENET_MEAN, IMAGENET_STD)
-        return pixels, self.labels.xyz[i], self.labels.f[i]
-
-
-class Conventional:
-    """The first loop of most projects, in float32 and torch's default memory format.
-
-    The workers of a DataLoader decode images one by one, and the errors of every sample are collected in Python.
-    """
-
-    def __init__(self, module: PositionModule, labels: Batch, config: RunConfig) -> None:
-        # contiguous whatever the programme chose, and the optimizer without its one kernel for all parameters
-        self.regressor = copy.deepcopy(module.regressor).to(memory_format=torch.contiguous_format)
-        self.loss, self.S = module.loss, labels.S
-        self.optimizer = torch.optim.Adam(self.regressor.parameters(), lr=1e-3, foreach=False)
-        pictures = Pictures(DatasetFolder(config.data.folder).split_folder("train"), labels)
-        self.loader = DataLoader(
-            pictures, config.data.batch_size, shuffle=True, num_workers=WORKERS, persistent_workers=True
-        )
-
-    def epoch(self) -> int:
-        """Train on every sample once; returns the number of samples."""
-        errors = []
-        for pixels, xyz, f in self.loader:
-            prediction = self.regressor.prediction(self.regressor.backbone(pixels), Camera(f, self.S))
-            loss = self.loss(prediction, xyz).mean()
-            self.optimizer.zero_grad()
-            loss.backward()
-            self.optimizer.step()
-            for truth, estimate in zip(xyz, prediction.mode.detach(), strict=True):
-                errors.append((projected_error(truth, estimate).item(), depth_error(truth, estimate).item()))
-        return len(errors)
-
-
 class Alternating(Callback):
     """Times the programme's epochs, and an epoch of another loop after each."""
 
-    def __init__(self, name: str, loop: Bare | Conventional) -> None:
+    def __init__(self, name: str, loop: Bare) -> None:
         self.name, self.loop = name, loop
         self.begin = self.trained = 0.0
 
@@ -181,12 +124,10 @@ def print_peak_memory() -> None:
 def main(kind: str, folder: Path, epochs: int, *overrides: str) -> None:
     words = ["logger=none", "trainer.progress_bar=false", *overrides]
     config = check(composed([*words, f"trainer.max_epochs={epochs}"] if epochs else words))
-    noise = PositionData(Noise(config), batch_size=config.data.batch_size, seed=0)
-    data = build_data(config) if kind == "conventional" else noise
+    data = PositionData(Noise(config), batch_size=config.data.batch_size, seed=0)
     data.setup()
     module = build_module(config, data)
-    loops = {"bare": Bare, "conventional": Conventional}
-    loop = loops[kind](module, data.samples["train"], config) if kind in loops else None
+    loop = Bare(module, data.samples["train"], config) if kind == "bare" else None
     if loop and not epochs:
         loop.epoch()
         loop.epoch()

@@ -11,7 +11,7 @@ from phd_exp.data.backdrops import BACKDROP_NUMBERS, Backdrops, before_others
 from phd_exp.data.batches import Batch, Exchange
 from phd_exp.data.photometry import Photometry
 from phd_exp.geometry import Camera
-from phd_exp.geometry.motion import Motion, symmetries
+from phd_exp.geometry.motion import symmetries
 
 SIDE = 48
 N = 64
@@ -105,12 +105,6 @@ def test_objects_stay_in_view(batch: Batch) -> None:
     assert new.camera.contains(new.xyz).all()
 
 
-def test_nothing_changes_without_a_motion(batch: Batch) -> None:
-    still = moved(batch, Motion(torch.eye(3).expand(N, 3, 3), torch.ones(N)))
-    assert torch.equal(still.image, batch.image)
-    assert torch.equal(still.xyz, batch.xyz)
-
-
 def test_colours_change_places_alone(noise: Batch) -> None:
     new = Augmentation(symmetries=False, largest_zoom=1.0, colours=True, photometry=PLAIN)(noise, numbers(1))
     assert torch.equal(new.xyz, noise.xyz)
@@ -120,21 +114,6 @@ def test_colours_change_places_alone(noise: Batch) -> None:
     # one order for all pixels of an image
     first = [noise.image[0, ..., channel] for channel in range(3)]
     assert all(any(torch.equal(new.image[0, ..., channel], one) for one in first) for channel in range(3))
-
-
-@pytest.mark.parametrize(
-    "part",
-    [{"symmetries": True}, {"largest_zoom": 1.2}, {"colours": True}, {"photometry": Photometry(brightness=2.0)}],
-)
-def test_each_part_is_there_by_itself(noise: Batch, part: dict) -> None:
-    nothing = {"symmetries": False, "largest_zoom": 1.0, "colours": False, "photometry": PLAIN}
-    assert not Augmentation(**nothing).changes_anything
-    augment = Augmentation(**(nothing | part))
-    assert augment.changes_anything
-    new = augment(noise, numbers(1))
-    assert not torch.equal(new.image, noise.image)
-    assert torch.equal(new.f, noise.f) == ("largest_zoom" not in part)
-    assert torch.equal(new.xyz, noise.xyz) == (part.keys() <= {"colours", "photometry"})
 
 
 @pytest.mark.parametrize("largest_zoom", [1.0, 1.2])

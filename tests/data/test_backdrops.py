@@ -103,24 +103,6 @@ def test_an_image_and_its_mirror_images_tile_the_plane() -> None:
     assert torch.equal(tile(image, FINEST, 0.37, 0.81, turn=0.1), fine.transpose(0, 1))
 
 
-def test_the_share_is_changed_and_then_augmented(batch: Batch) -> None:
-    class Darken:
-        n_numbers = 2
-
-        def __call__(self, batch: Batch, given: torch.Tensor) -> Batch:
-            assert torch.equal(given, draw[:, :2])
-            return Batch(batch.image // 2, batch.xyz, batch.f, batch.S, batch.row)
-
-    clear = torch.full((N, SIDE, SIDE), 255, dtype=torch.uint8)
-    backdrops = Backdrops(torch.randint(0, 256, batch.image.shape, dtype=torch.uint8), clear)
-    draw = numbers(BACKDROP_NUMBERS + 2)
-    for share in (0.0, 0.4, 1.0):
-        darkened = exchange(backdrops, share, Darken())
-        assert darkened.n_numbers == BACKDROP_NUMBERS + 2
-        changed = (darkened(batch, draw).image != batch.image // 2).any((1, 2, 3))
-        assert changed.float().mean() == pytest.approx(share, abs=0.15)
-
-
 def test_training_batches_alone_get_other_backdrops_and_prints(source: RenderedSource) -> None:
     shares = ({}, {"backdrops": 1.0}, {"prints": 1.0}, {"backdrops": 1.0, "prints": 1.0})
     first, *others = (PositionData(source, batch_size=2, **share) for share in shares)

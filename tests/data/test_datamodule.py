@@ -78,13 +78,6 @@ def test_callbacks_see_the_held_out_samples_that_choose(folder: DatasetFolder, s
     assert rows == [[[0, 1], [2]], [[0, 2]]]
 
 
-def test_too_few_samples_are_one_line(folder: DatasetFolder, spec: DatasetSpec) -> None:
-    with pytest.raises(DatasetError, match="6 samples asked for, 5 "):
-        data(folder, spec, n_train=6)
-    with pytest.raises(DatasetError, match="6 samples asked for, 5 "):
-        data(folder, spec, n_train=4, n_held_out=2)
-
-
 @pytest.mark.parametrize("share", [0.9, 2.1])
 def test_samples_without_room_on_a_gpu_stay_on_the_host(
     folder: DatasetFolder, spec: DatasetSpec, share: float, monkeypatch: pytest.MonkeyPatch, capsys: Any

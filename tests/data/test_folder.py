@@ -11,19 +11,15 @@ import pytest
 import torch
 from PIL import Image
 
-from phd_exp.build import build_source
-from phd_exp.config import check
 from phd_exp.data import folder as folder_module
-from phd_exp.data.datamodule import PositionData
 from phd_exp.data.folder import FolderSource
 from phd_exp.data.sources import RenderedSource, blocks
 from phd_exp.geometry import projected
-from phd_exp.records.dataset import SPLITS, DatasetFolder
+from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.detections import DetectionLine
-from phd_exp.records.errors import ConfigError, DatasetError
+from phd_exp.records.errors import DatasetError
 from phd_exp.records.own_images import DetectionFolder
 from phd_exp.records.spec import DatasetSpec
-from tests.support.foreign import write_bop
 
 BOXED: dict[str, Any] = {"file_name": "wide.jpg", "fx": 300.0, "fy": 320.0, "cx": 70.0, "cy": 40.0, "z": 2.0}
 
@@ -89,17 +85,6 @@ def test_samples_are_in_the_frame_of_their_virtual_cameras(photos: DetectionFold
     assert (projected(batch.xyz, batch.camera)[:1].abs() < 1).all()  # the first lies in its box
 
 
-def test_constants_follow_from_the_training_detections(photos: DetectionFolder) -> None:
-    own = source(photos)
-    batch = own.samples("train")
-    ratio = (batch.xyz[:, 2] / batch.f).double()
-    depth, f = own.depth, batch.f.double()
-    assert depth.mu_z0 == pytest.approx(math.sqrt(ratio.max() * ratio.min()))
-    assert math.sqrt(ratio.max() / ratio.min()) == pytest.approx(depth.D)
-    assert depth.z_centre == pytest.approx(float(batch.xyz[:, 2].max() + batch.xyz[:, 2].min()) / 2)
-    assert own.constant_f == pytest.approx(math.sqrt(f.min() * f.max()))
-
-
 def test_what_is_known_is_what_the_lines_say(photos: DetectionFolder) -> None:
     own = source(photos)
     assert own.known("train").keys() == {"file_name", "f", "S", "block"}
@@ -136,22 +121,6 @@ def test_what_is_held_out_follows_what_is_trained_on(
     assert torch.equal(held_out.xyz, there.xyz)
     ratio = (own.samples("train").xyz[:, 2] / own.samples("train").f).double()
     assert own.depth.mu_z0 == pytest.approx(math.sqrt(ratio.max() * ratio.min())), "of those trained on alone"
-
-
-def test_an_object_of_bop_is_a_source(composed: Callable[..., dict[str, Any]], tmp_path: Path) -> None:
-    for split in SPLITS:
-        write_bop(tmp_path / split)
-    words = ("preset=smoke", "data=folder", f"data.folder={tmp_path}", "data.batch_size=2", "data.object=5")
-    own = build_source(check(composed(*words)).data)
-    assert own.count("train") == 3
-    assert own.known("test")["visibility"] == [0.75, 1, 1]
-    for row, detection in zip(own.samples("test").xyz, DetectionFolder(tmp_path, 5).detections("test"), strict=True):
-        assert float(row.norm()) == pytest.approx(float(np.linalg.norm(detection.position)))
-
-
-def test_something_must_be_left_to_train_on(photos: DetectionFolder) -> None:
-    with pytest.raises(ConfigError, match=r"data.n_held_out: got 3, but .* has 3 detections"):
-        FolderSource(photos, None, 3, None, 48)
 
 
 def test_decodes_each_image_once(photos: DetectionFolder, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -249,11 +218,3 @@ def test_what_cannot_be_a_sample_is_one_line_and_leaves_no_cache(
         images(photos)
     assert "\n" not in str(caught.value)
     assert not list(photos.cache.glob("*.npy"))
-
-
-def test_fewer_images_than_a_batch_is_one_line(photos: DetectionFolder) -> None:
-    with pytest.raises(ConfigError, match=r"^data: batch_size=4 is larger than the 3 training samples"):
-        PositionData(source(photos), batch_size=4, seed=0)
-    module = PositionData(source(photos), batch_size=3, seed=0)
-    module.setup()
-    assert len(module.train_dataloader()) == 1

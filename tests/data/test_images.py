@@ -3,7 +3,6 @@
 import os
 import shutil
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import pytest
@@ -12,7 +11,7 @@ from PIL import Image
 
 from phd_exp.data import images
 from phd_exp.data.images import cached_images, shrunk
-from phd_exp.records.dataset import DatasetFolder, mapped, sha256
+from phd_exp.records.dataset import DatasetFolder, mapped
 from phd_exp.records.errors import DatasetError
 from tests.support.disks import small_disk
 
@@ -40,12 +39,6 @@ def area_means(image: np.ndarray, side: int) -> np.ndarray:
         overlap = np.minimum(edges[1:, None], left + 1) - np.maximum(edges[:-1, None], left)
         image = np.moveaxis(np.tensordot(overlap.clip(0) * side / n, image, (1, axis)), 0, axis)
     return image
-
-
-def test_rendered_images_are_shrunk(folder: DatasetFolder) -> None:
-    for side in (SIDE // 2, 37):
-        array = cached_images(folder, "train", folder.records("train"), side)
-        np.testing.assert_array_equal(array[0], shrunk(picture(folder, 0), side))
 
 
 SIZES = [(224, 224, 64), (224, 224, 112), (301, 220, 64), (100, 37, 33), (97, 97, 96), (40, 30, 64), (1, 5000, 7)]
@@ -106,13 +99,6 @@ def test_images_that_exceed_the_memory_are_read_where_they_are(tmp_path: Path) -
     assert images.flatten(1).amax(1).tolist() == [0, 7]
 
 
-@pytest.mark.parametrize("order", ["C", "F"])
-def test_a_mapped_array_has_the_values_of_its_file_in_either_order(tmp_path: Path, order: Literal["C", "F"]) -> None:
-    array = np.arange(2 * 3 * 4, dtype=np.uint8).reshape(2, 3, 4)
-    np.save(tmp_path / "array.npy", np.asarray(array, order=order))
-    np.testing.assert_array_equal(mapped(tmp_path / "array.npy", (1, 3, 4)), array[:1])
-
-
 @pytest.mark.parametrize(
     ("damage", "said"),
     [
@@ -127,23 +113,6 @@ def test_a_damaged_image_is_one_line_and_leaves_no_cache(folder: DatasetFolder, 
     with pytest.raises(DatasetError, match=rf"train/000003\.png: .*{said}.*render"):
         cached_images(folder, "train", folder.records("train"), 32)
     assert not list(folder.cache.glob("*.npy"))
-
-
-def test_what_is_no_image_is_one_line(folder: DatasetFolder) -> None:
-    record = folder.records("train")[0].model_copy(update={"sha256": sha256(b"no image")})
-    folder.image_path("train", 0).write_bytes(b"no image")
-    with pytest.raises(DatasetError, match="cannot be read as an image"):
-        cached_images(folder, "train", [record], 32)
-
-
-def test_two_processes_may_decode_at_once(folder: DatasetFolder) -> None:
-    from concurrent.futures import ThreadPoolExecutor
-
-    records = folder.records("train")
-    with ThreadPoolExecutor(4) as pool:  # each call opens the lock file anew, as a process would
-        arrays = list(pool.map(lambda _: cached_images(folder, "train", records, 32), range(8)))
-    for array in arrays:
-        np.testing.assert_array_equal(array, arrays[0])
 
 
 def test_images_of_a_read_only_data_set_are_decoded_into_memory(

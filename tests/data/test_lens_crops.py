@@ -70,16 +70,6 @@ def test_the_centroid_of_a_ball_is_within_a_twentieth_of_a_pixel(
         assert np.abs(centroid - expected).max() < 0.05
 
 
-def test_shrinking_through_a_lens_averages_and_a_faint_lens_is_nearly_none() -> None:
-    K = intrinsics(900.0, 900.0, 640.0, 480.0)
-    noise = np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
-    box = (100.0, 50.0, 1100.0, 900.0)
-    faint, none = (VirtualCamera.of_box(K, box, 40.0, lens) for lens in (Lens((1e-9,)), Lens()))
-    views = [cut(Image.fromarray(noise), camera).astype(float) for camera in (faint, none)]
-    assert np.abs(views[0] - views[1]).max() < 6
-    assert np.abs(views[0] - 127.5).max() < 25, "means of hundreds of pixels"
-
-
 def test_what_has_no_image_is_grey() -> None:
     """Beyond the edge of the photograph, and beyond the angle at which the lens folds over."""
     lens, K = Lens((-0.3,)), intrinsics(500.0, 500.0, 300.0, 300.0)

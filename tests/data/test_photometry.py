@@ -104,16 +104,6 @@ def test_noise_is_normal_and_rounded(deviation: float) -> None:
     assert (noise[1] == 128).all()
 
 
-def test_noise_and_compression() -> None:
-    edge = images(1)
-    edge[:, :, SIDE // 2 :] = 255
-    noise = value(Photometry(noise=10.0)(images(1), drawn(1.0, "noise"))) - value(images(1))
-    assert noise.std() * 255 == pytest.approx(10, rel=0.05)
-    assert abs(noise.mean()) * 255 < 1
-    lossy = [value(Photometry(jpeg=20)(edge, drawn(strength, "jpeg"))) - value(edge) for strength in (0.8, 1.0)]
-    assert 0 < lossy[0].std() < lossy[1].std() < 0.2
-
-
 def test_an_occluder_hides_a_convex_part_by_one_colour_and_the_original_stays() -> None:
     before = images()
     after = Photometry(occluders=1.0)(before, numbers())

@@ -8,10 +8,7 @@ import torch
 
 from phd_exp.data.backdrops import BACKDROP_NUMBERS, Backdrops, before_others
 from phd_exp.data.batches import Batch, Exchange
-from phd_exp.data.datamodule import PositionData
 from phd_exp.data.prints import GREY, PRINT_NUMBERS, printed
-from phd_exp.data.sources import Part, Source
-from phd_exp.geometry.charts import DepthScale
 
 SIDE, N, HALF = 32, 40, 16
 
@@ -76,35 +73,3 @@ def test_a_share_of_other_backdrops_is_nearly_plain(plain: float) -> None:
     assert is_plain.float().mean() == pytest.approx(plain, abs=0.15)
     if plain:
         assert mean[is_plain].std() > 50  # of uniform brightness
-
-
-class Objects(Source):
-    """The samples of `scene`."""
-
-    depth, constant_f, has_backdrops = DepthScale.from_ranges(f_range=(1.0, 2.0), z_range=(1.0, 2.0)), 1.0, True
-
-    def samples(self, part: Part) -> Batch:
-        return replace(scene(60)[1], row=torch.arange(N))
-
-    def known(self, part: Part) -> dict:
-        return {}
-
-    def count(self, part: Part) -> int:
-        return N
-
-    def training_backdrops(self) -> Backdrops:
-        backdrops, batch = scene(60)
-        return Backdrops(backdrops.empty[batch.row], backdrops.clear)
-
-
-@pytest.mark.parametrize("prints", [0.0, 1.0])
-@pytest.mark.parametrize("backdrops", [0.0, 1.0])
-def test_training_samples_have_other_backdrops_then_prints(backdrops: float, prints: float) -> None:
-    data = PositionData(Objects(), batch_size=N, seed=0, backdrops=backdrops, plain=backdrops, prints=prints)
-    data.setup()
-    (new,) = data.train_dataloader()
-    before = data.samples["train"].image[new.row]
-    changed = (new.image != before).any(-1)[:, SIDE // 4 :].float()
-    assert changed[:, :, :HALF].mean() == pytest.approx(0.8 * prints, abs=0.2)
-    assert changed[:, :, HALF:].mean() == pytest.approx(backdrops, abs=0.05)
-    assert (new.image[:, SIDE // 4 :, HALF:].float().std((1, 2, 3)).mean() < 40) == bool(backdrops)

@@ -10,7 +10,7 @@ from torch import nn
 from torch.testing import assert_close
 
 from phd_exp.config.targets import build
-from phd_exp.geometry import Camera, Cartesian, DepthScale, LogDepth, Projected
+from phd_exp.geometry import Camera, DepthScale, LogDepth, Projected
 from phd_exp.geometry.camera import middles
 from phd_exp.geometry.charts import projected
 from phd_exp.models.heads import ChartHead, DistributionHead, Head
@@ -49,19 +49,6 @@ def test_it_sees_the_middle_before_it_has_learned(depth: int) -> None:
     assert_close(seen.place, torch.zeros(2, 2), atol=1e-6, rtol=0)
 
 
-def test_a_larger_stride_sees_a_larger_image_as_often() -> None:
-    small, large = (Locating(10, width=8, stride=stride, channels=6) for stride in (2, 4))
-    for network, side in ((small, 64), (large, 128)):
-        heat = network(torch.randn(1, 3, side, side)).log_heat
-        assert heat.shape == (1, 16, 16)
-
-
-def test_cells_lie_in_the_middles_of_equal_parts() -> None:
-    x, y = middles(2, 4).movedim(-1, 0)
-    assert_close(x[0], torch.tensor([-0.75, -0.25, 0.25, 0.75]))
-    assert_close(y[:, 0], torch.tensor([-0.5, 0.5]))
-
-
 def test_the_place_is_the_mean_of_the_map_and_its_offsets() -> None:
     network = locating()
     torch.nn.init.normal_(network.map.weight)
@@ -88,17 +75,6 @@ def test_the_recipe_costs_no_more_than_the_authors_network(preset: str, composed
         return counter.get_total_flops()
 
     assert operations("strong") < 1.3 * operations("paper")
-
-
-def test_a_segment_adds_its_means_and_its_shape_to_the_features() -> None:
-    network = locating(segments=True)
-    with torch.no_grad():
-        network.map.bias[3] = -40  # nothing is visible: means of the whole map, an area of nearly zero
-        seen = network(torch.randn(2, 3, 64, 96))
-    assert seen.features.shape == (2, network.n_features)
-    assert network.n_features == 6 + 64 + 6 + 6
-    assert seen.log_odds.shape == (2, 16, 24)
-    assert seen.features.isfinite().all()
 
 
 @pytest.mark.parametrize("stretch", [1.0, 2.0])
@@ -194,11 +170,6 @@ def test_a_nearly_singular_precision_does_not_move_the_centre_far_away() -> None
     placed = head.placed(torch.tensor([3.5, -0.4, 35.1, 10.9, -8.7, -1.2, 3.0]), place)
     away = projected(head(placed, CAMERA).mode, CAMERA) - place
     assert torch.linalg.vector_norm(away, dim=-1).max() < 3  # half sides of the image
-
-
-def test_a_chart_without_a_projection_is_not_placed() -> None:
-    raw = torch.randn(4, 3)
-    assert torch.equal(ChartHead(DEPTH, Cartesian).placed(raw, torch.ones(4, 2)), raw)
 
 
 @pytest.mark.parametrize("name", PLACED)

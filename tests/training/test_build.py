@@ -38,11 +38,6 @@ def checked(composed: Callable[..., dict[str, Any]]) -> Callable[..., RunConfig]
     return lambda *overrides: check(composed("preset=smoke", *overrides))
 
 
-@pytest.mark.parametrize(("named", "expected"), [("float32", "32-true"), ("bfloat16", "bf16-mixed")])
-def test_a_named_precision_is_used(checked: Callable, named: str, expected: str) -> None:
-    assert arithmetic(checked("trainer=cpu", f"trainer.precision={named}")) == expected
-
-
 @pytest.mark.parametrize(("has_units", "expected"), [(True, "bf16-mixed"), (False, "32-true")])
 def test_bfloat16_only_on_hardware_with_units_for_it(
     checked: Callable, monkeypatch: pytest.MonkeyPatch, has_units: bool, expected: str
@@ -60,10 +55,6 @@ def test_the_losses_of_a_map_require_a_backbone_that_has_one(checked: Callable, 
     config = checked(f"recipe.{loss}=1")
     with pytest.raises(ConfigError, match=rf"^recipe\.{loss}: got 1\.0, but this backbone has no map of the object"):
         build_module(config, build_data(config))
-
-
-def test_a_constant_learning_rate_has_the_factor_one() -> None:
-    assert {factor("constant", 0, 100)(step) for step in range(100)} == {1.0}
 
 
 def test_the_learning_rate_rises_linearly_and_falls_as_half_a_wave() -> None:
@@ -186,7 +177,3 @@ def test_curves_are_those_of_the_evaluations_nearest_to_the_wanted_epochs(wanted
     assert {epochs for epochs in found if epochs < 250} == {epochs for epochs in nearest if epochs < 250}
     if wanted % every == 0:
         assert found == {epochs for epochs in evaluated if epochs % wanted == 0}
-
-
-def test_the_interval_of_evaluations_is_free(composed: Callable) -> None:
-    assert check(composed("preset=smoke", "evaluation.every_n_epochs=22")).evaluation.every_n_epochs == 22

@@ -22,7 +22,7 @@ from phd_exp.inference.further import record_further
 from phd_exp.records.errors import RunError
 from phd_exp.records.runs import RunFolder
 from phd_exp.training.build import build_data, build_module
-from phd_exp.training.cameras import f_factor, standard_error
+from phd_exp.training.cameras import standard_error
 from phd_exp.training.predictions import write_parquet
 from tests.support.recorded import once
 
@@ -35,11 +35,6 @@ def test_the_errors_are_normal_over_the_samples_of_an_epoch_and_over_the_epochs_
     for row in (0, 13, 7999):
         over_epochs = torch.stack([standard_error(ROWS[row : row + 1], epoch) for epoch in range(50)])
         assert kstest(over_epochs.flatten(), "norm").statistic < 0.05
-
-
-def test_the_errors_of_an_epoch_do_not_follow_the_order_of_the_samples() -> None:
-    shares = standard_error(ROWS, 3)
-    assert abs(float(torch.corrcoef(torch.stack([shares, ROWS.float()]))[0, 1])) < 0.01
 
 
 def test_the_model_receives_focal_lengths_within_the_error_and_the_labels_stay(composed: Callable) -> None:
@@ -129,7 +124,3 @@ def test_tables_of_exact_focal_lengths_are_recorded_again(run: RunFolder, tmp_pa
     tables.require_received(
         old.views, config.model_copy(update={"camera": config.camera.model_copy(update={"f_error": 0.0})})
     )
-
-
-def test_without_an_error_every_focal_length_is_exact() -> None:
-    assert torch.equal(f_factor(ROWS, 0.0), torch.ones(len(ROWS)))

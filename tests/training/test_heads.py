@@ -5,8 +5,6 @@ import torch
 
 from phd_exp.data.batches import Batch
 from phd_exp.evaluation.predictions import evaluate
-from phd_exp.fusion.gaussian import gaussian_fusion
-from phd_exp.geometry import Camera
 from phd_exp.training.predictions import calibration_curves, columns, summary
 from tests.support.heads import SHAPED
 
@@ -32,16 +30,3 @@ def test_a_density_is_recorded_and_evaluated_without_parameters(model: str) -> N
     assert evaluation.reference == {}
     assert {"nll", "inside_90", "depth_crps_mm", "energy_score_mm"} < evaluation.scores.keys()
     assert "coverage" in evaluation.curves
-
-
-def test_gaussians_fuse_in_closed_form() -> None:
-    """The fused mean is the maximum of the product of the densities, for two cameras with the same frame."""
-    raw = torch.randn(2, SHAPED["gaussian"].n_outputs, generator=torch.Generator().manual_seed(0)).double()
-    camera = Camera(torch.full((2,), 1550.0, dtype=torch.float64), 224.0)
-    views = SHAPED["gaussian"](raw, camera)
-    fused, covariance = gaussian_fusion(views.mean, views.covariance_matrix)
-    xyz = fused.clone().requires_grad_()
-    (slope,) = torch.autograd.grad(views.log_prob(xyz.expand(2, 3)).sum(), xyz)
-    torch.testing.assert_close(slope, torch.zeros(3).double(), atol=1e-4, rtol=0)
-    curvature = torch.autograd.functional.hessian(lambda v: -views.log_prob(v.expand(2, 3)).sum(), fused)
-    torch.testing.assert_close(torch.linalg.inv(curvature), covariance, rtol=1e-3, atol=1e-6)

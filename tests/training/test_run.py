@@ -82,21 +82,6 @@ def test_every_model_leaves_a_whole_record(run: RunFolder, model: str) -> None:
     assert scores & row.keys() == (scores if model == "probabilistic" else set())
 
 
-def test_a_key_that_an_older_record_lacks_had_its_default(composed: Callable, tmp_path: Path) -> None:
-    folder = RunFolder(tmp_path)
-    config = check(composed("preset=smoke", "recipe=strong"))
-    stored = config.model_dump(mode="json")
-    del stored["recipe"]["augmentation"]["occluders"]
-    folder.write_config(stored)
-    require_same_config(folder, config)
-    with pytest.raises(
-        RunError, match=r"recipe.augmentation.occluders=nothing, but recipe.augmentation.occluders=0.5 is"
-    ):
-        require_same_config(
-            folder, check(composed("preset=smoke", "recipe=strong", "recipe.augmentation.occluders=0.5"))
-        )
-
-
 def test_results_are_those_of_the_last_epoch_and_of_the_predictions(run: RunFolder, model: str) -> None:
     results, table = run.results(), pd.read_parquet(run.predictions)
     untrained, *_, last = run.metrics()
