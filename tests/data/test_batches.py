@@ -77,12 +77,6 @@ def test_resumes_with_the_remaining_batches(samples: Batch, done: int) -> None:
     assert found == expected[3:]
 
 
-def test_moves_to_a_device_whole(samples: Batch) -> None:
-    moved = samples.to("meta")
-    assert {moved.image.device.type, moved.xyz.device.type, moved.f.device.type} == {"meta"}
-    assert moved.S == samples.S
-
-
 def test_samples_are_copied_to_another_device_batch_by_batch(samples: Batch) -> None:
     for batch in loader(samples, device=torch.device("meta")):
         assert (batch.image.device.type, batch.image.shape) == ("meta", (3, 4, 4, 3))

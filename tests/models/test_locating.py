@@ -14,7 +14,7 @@ from phd_exp.geometry import Camera, DepthScale, LogDepth, Projected
 from phd_exp.geometry.camera import middles
 from phd_exp.geometry.charts import projected
 from phd_exp.models.heads import ChartHead, DistributionHead, Head
-from phd_exp.models.locating import Locating, LocatingNetwork, _of_points, _of_segment
+from phd_exp.models.locating import Locating, LocatingNetwork, _of_segment
 from phd_exp.models.regressor import Regressor
 from tests.support.heads import SHAPED
 
@@ -99,14 +99,6 @@ def test_points_add_their_places_relative_to_the_objects_and_their_variances() -
     assert_close(places, -seen.place.repeat(1, 2), atol=1e-6, rtol=0)
     assert_close(variances.exp(), torch.full((3, 2), 2 * (1 - 1 / 16**2) / 3))
     assert seen.features.shape == (3, network.n_features)
-
-
-def test_a_point_lies_at_the_mean_of_its_map() -> None:
-    cells = middles(4, 4).flatten(0, 1).T
-    probability = torch.zeros(1, 1, 16)
-    probability[..., [5, 6]] = 0.5  # the second row, both cells next to its middle
-    x, y, log_variance = _of_points(probability, cells, torch.tensor([[0.5, 0.25]]))[0]
-    assert_close(torch.stack([x, y, log_variance.exp()]), torch.tensor([-0.5, -0.5, 0.25**2]))
 
 
 class Maps(nn.Module):

@@ -11,12 +11,15 @@ import torch
 from phd_exp.config import check
 from phd_exp.data.batches import Batch
 from phd_exp.distributions import PointEstimate, ProjectedHuber
-from phd_exp.distributions.columns import distribution_columns, from_columns
+from phd_exp.distributions.columns import from_columns
+from phd_exp.evaluation.predictions import evaluate
 from phd_exp.geometry import DepthScale, Projected
 from phd_exp.metrics.rows import Rows
 from phd_exp.training.build import build_data, build_module
 from phd_exp.training.predictions import calibration_curves, columns, summary, write_parquet
+from tests.support.heads import SHAPED
 
+N = 60
 DEPTH = DepthScale.from_ranges(f_range=(1200.0, 2000.0), z_range=(3.0, 5.0))
 
 
@@ -111,22 +114,6 @@ def test_the_error_of_the_distance_is_measured_from_the_camera(batch: Batch) -> 
         torch.testing.assert_close(table["relative_error"], 100 * table["ale_m"] / distance, rtol=1e-4, atol=1e-5)
 
 
-def test_curves_of_samples_of_the_distribution_itself_are_calibrated() -> None:
-    """Positions drawn from the predictions: both curves must lie on the identity."""
-    n = 20_000
-    generator = torch.Generator().manual_seed(2)
-    raw = torch.zeros(n, 7, dtype=torch.float64)
-    raw[:, 2], raw[:, 4] = 5 + 40 * torch.rand(2, n, generator=generator, dtype=torch.float64)
-    raw[:, 5] = 5 + 20 * torch.rand(n, generator=generator, dtype=torch.float64)
-    f = torch.full((n,), 1500.0, dtype=torch.float64)
-    prediction = ProjectedHuber.from_raw(raw, f=f, S=224.0, mu_z0=DEPTH.mu_z0)
-    torch.manual_seed(3)
-    table = distribution_columns(prediction, prediction.sample())
-    for name, curve in calibration_curves(table, window=4000).items():
-        ratio = curve.empirical / curve.predicted
-        assert ((ratio > 0.85) & (ratio < 1.15)).all(), (name, ratio.min(), ratio.max())
-
-
 def test_the_record_is_in_the_order_of_the_data_set(
     batch: Batch, distribution: ProjectedHuber, tmp_path: Path
 ) -> None:
@@ -139,3 +126,24 @@ def test_the_record_is_in_the_order_of_the_data_set(
     assert frame["f"].tolist() == known["f"]
     assert frame["z"].tolist() == batch.xyz[:, 2].flip(0).double().tolist()
     assert "row" not in frame
+
+
+@pytest.mark.parametrize("model", SHAPED)
+def test_a_density_is_recorded_and_evaluated_without_parameters(model: str) -> None:
+    """As by an untrained network, on positions throughout the range."""
+    generator = torch.Generator().manual_seed(0)
+    z = 3 + 2 * torch.rand(N, generator=generator)
+    xyz = torch.stack([0.05 * z, -0.02 * z, z], dim=-1)
+    batch = Batch(torch.zeros(N, 2, 2, 3, dtype=torch.uint8), xyz, torch.full((N,), 1550.0), 224.0, torch.arange(N))
+    raw = torch.randn(N, SHAPED[model].n_outputs, generator=generator)
+    prediction = SHAPED[model](raw, batch.camera)
+    table = columns(prediction, batch)
+    assert "a" not in table
+    assert all(column.isfinite().all() for column in table.values())
+    assert summary(table)["test/nll"] == pytest.approx(float(-prediction.log_prob(xyz).mean()), rel=1e-5)
+    assert calibration_curves(table, 20).keys() == {"depth", "projected"}
+    evaluation = evaluate({name: column.numpy() for name, column in table.items()}, resamples=20)
+    assert evaluation.left_out == 0
+    assert evaluation.reference == {}
+    assert {"nll", "inside_90", "depth_crps_mm", "energy_score_mm"} < evaluation.scores.keys()
+    assert "coverage" in evaluation.curves

@@ -108,11 +108,6 @@ def test_the_untrained_network_predicts_the_centre_of_the_data_set(run: RunFolde
     assert run.results()["untrained/test/depth_error_mm"] == expected
 
 
-def test_the_schedule_makes_one_step_per_batch(whole: RunFolder) -> None:
-    content = torch.load(whole.last_checkpoint, weights_only=True)
-    assert content["lr_schedulers"][0]["last_epoch"] == content["global_step"] == 8
-
-
 def test_a_run_comes_to_the_same_numbers_whatever_interrupts_it(
     run_in: Callable, whole: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
 ) -> None:
