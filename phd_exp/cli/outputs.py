@@ -50,8 +50,7 @@ def require_output(out: Path, name: str, arguments: Arguments, inputs: Iterable[
     except OSError as error:
         fault, _, _ = str(error.strerror).partition(";")
         raise ConfigError(f"{key}={out}: {fault}; expected a new file, such as {name}") from None
-    _require_unread(out, [out, _place(out).parent], arguments, inputs, key)
-    _require_outside_run(out, arguments, key, name)
+    _require_apart(out, [out, _place(out).parent], arguments, inputs, key, name)
     if start and not re.match(KINDS[Path(name).suffix], start, re.DOTALL):
         raise ConfigError(
             f"{key}={out}: holds other data than this command writes; expected a new file, such as {name}; move the "
@@ -66,10 +65,13 @@ def _place(path: Path) -> Path:
     return Path(os.path.realpath(path))
 
 
-def _require_unread(
-    out: Path, files: Iterable[Path], arguments: Arguments, inputs: Iterable[Path], key: str = "out"
+def _require_apart(
+    out: Path, files: Iterable[Path], arguments: Any, inputs: Iterable[Path], key: str = "out", own: str | None = None
 ) -> None:
-    """Raise ConfigError if one of an output's files is an input or named by an argument, or a recording that is."""
+    """Raise ConfigError if one of an output's files is read or lies in a recording that is.
+
+    Raises ConfigError too if the output is or lies in the folder of the run, and is not the file `own` there.
+    """
     others = [value for word, value in arguments if word not in ("out", "view")]
     named = chain(*(value if isinstance(value, tuple) else (value,) for value in others))
     paths = [Path(word) for word in named if isinstance(word, str | Path) and os.path.exists(word)]
@@ -78,15 +80,10 @@ def _require_unread(
         raise ConfigError(
             f"{key}={out}: is one of the files that are read, or lies in the recording; choose another place"
         )
-
-
-def _require_outside_run(out: Path, arguments: Any, key: str, name: str | None = None) -> None:
-    """Raise ConfigError if an output is or lies in the folder of the run, and is not `name` there."""
-    run = getattr(arguments, "run", ())
-    for folder in run if isinstance(run, tuple) else (run,):
-        place, run_place = _place(out), _place(folder)
-        if run_place.is_dir() and place.is_relative_to(run_place) and not (name and place == run_place / name):
-            raise ConfigError(f"{key}={out}: lies in the run's folder {folder}; choose another place")
+    run, place = getattr(arguments, "run", ()), _place(out)
+    for folder in map(_place, run if isinstance(run, tuple) else (run,)):
+        if folder.is_dir() and place.is_relative_to(folder) and not (own and place == folder / own):
+            raise ConfigError(f"{key}={out}: lies in the run's folder; choose another place")
 
 
 @contextmanager
@@ -123,8 +120,7 @@ def places(arguments: Any, inputs: Sequence[Path], name: str, files: Sequence[st
     elif out is not None:
         if _place(out) in {path if path.is_dir() else path.parent for path in map(_place, inputs)}:
             raise ConfigError(f"out={out}: holds the images themselves; choose another folder")
-        _require_unread(out, [out / file for file in files], arguments, inputs)
-        _require_outside_run(out, arguments, "out")
+        _require_apart(out, [out / file for file in files], arguments, inputs)
         output_folder(out)
         with writing(out, "out=", ConfigError):
             Written(out, name).require(*files)

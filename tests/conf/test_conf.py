@@ -8,20 +8,18 @@ from typing import Any
 import pytest
 import yaml
 
-from phd_exp.cli import conf_folder
-from phd_exp.config import RenderedConfig, RunConfig, check, check_render
+from phd_exp.cli import choices_of, conf_folder
+from phd_exp.cli.help import OF_VERB
+from phd_exp.config import RunConfig, check, check_render
 from phd_exp.records.choices import has_influence
 from phd_exp.records.errors import ConfigError
 from phd_exp.records.runs import SECTIONS
 from phd_exp.records.spec import DatasetSpec
 from tests.support.renders import RENDER
 
-CHOICES = {
-    group.name: [f"{group.name}={file.stem}" for file in sorted(group.glob("*.yaml"))]
-    for group in sorted(path for path in conf_folder().iterdir() if path.is_dir())
-    if group.name != "loss"  # chosen by the model
-}
-TOGETHER = [tuple(word for word in words if word) for words in zip_longest(*CHOICES.values())]
+GROUPS = sorted({*OF_VERB["train"]} - {"loss"})  # which the model chooses
+CHOICES = [[f"{group}={name}" for name in choices_of(group)] for group in GROUPS]
+TOGETHER = [tuple(filter(None, words)) for words in zip_longest(*CHOICES)]
 
 
 @pytest.fixture
@@ -77,7 +75,8 @@ def test_variants_differ_only_in_the_keys_of_their_files(checked: Callable, vari
 def test_sequences_are_of_the_runs_own_scenes_and_others_are_held_out(checked: Callable) -> None:
     config = checked("data=occl", "evaluation.sequences=[[5,20],[2,200]]", "data.seed=3", "data.z_range=[4,5]")
     single = config.data.spec
-    for (n, frames, held_out), found in zip([(5, 20, 3), (2, 200, 1)], pairs(config), strict=True):
+    for n, frames, held_out in [(5, 20, 3), (2, 200, 1)]:
+        found = [config.sequences[frames, False], config.sequences[frames, True]]
         tested, choosing = (one.spec for one in found)
         assert (tested.variant, choosing.variant) == (f"occl-sequences-{frames}", f"occl-sequences-{frames}-held-out")
         assert differing(single, tested) == {"variant", "frames"}
@@ -93,13 +92,7 @@ def test_sequences_are_of_the_runs_own_scenes_and_others_are_held_out(checked: C
     assert checked("data=occl").sequences == {}
     assert not has_influence("evaluation.sequences")
     assert not has_influence("evaluation.sequence_cameras")
-
-
-def pairs(config: RunConfig) -> list[tuple[RenderedConfig, RenderedConfig]]:
-    return [(config.sequences[frames, False], config.sequences[frames, True]) for frames in (20, 200)]
-
-
-def test_the_file_of_sequences_states_the_defaults_of_their_motion(checked: Callable) -> None:
+    # the file of sequences states the defaults of their motion
     assert differing(checked("data=scale").data.spec, checked("data=sequence").data.spec) == {"variant", "frames"}
 
 
