@@ -10,8 +10,7 @@ from PIL import ExifTags, Image
 
 from phd_exp.data.areas import GREY, view
 from phd_exp.data.images import shrunk
-from phd_exp.optics.lens import PINHOLE, Lens
-from phd_exp.optics.virtual import VirtualCamera, intrinsics, require_no_fold
+from phd_exp.optics.virtual import VirtualCamera
 from phd_exp.records.detections import LARGEST_BOX, Detection
 from phd_exp.records.errors import DatasetError
 from phd_exp.records.files import require_plain
@@ -56,27 +55,13 @@ def read_image(file: Path, content: bytes) -> Image.Image:
         return _as_rgb(file, image)
 
 
-def optics_of(detection: Detection, size: tuple[int, int]) -> tuple[Float[np.ndarray, "3 3"], Lens]:
-    """The camera matrix (pixels) and the lens of a detection's image of that width and height.
-
-    Raises DatasetError if the camera file is for another size, or its lens folds over inside.
-    """
-    K, file = intrinsics(*detection.focal_lengths_and_centre(*size)), detection.calibration
-    lens = file.lens if file else PINHOLE
-    try:
-        require_no_fold(K, lens, *size)
-    except ValueError as error:
-        raise DatasetError(f"{detection.where}: {error}") from None
-    return K, lens
-
-
 def facing(detection: Detection, size: tuple[int, int], side: int) -> VirtualCamera:
     """The virtual camera that faces a detection in an image of that width and height.
 
-    Raises DatasetError if the box is too wide, or as `optics_of`.
+    Raises DatasetError if the box is too wide, or as `Detection.optics`.
     """
     box = detection.box(*size)
-    K, lens = optics_of(detection, size)
+    K, lens = detection.optics(*size)
     try:
         return VirtualCamera.of_box(K, box, float(side), lens)
     except ValueError as error:

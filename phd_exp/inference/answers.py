@@ -15,7 +15,7 @@ from PIL import Image
 from torch import Tensor
 
 from phd_exp.data.cache import DECODERS, LARGEST_AT_ONCE
-from phd_exp.data.crops import cut, optics_of, read_image, true_position
+from phd_exp.data.crops import cut, read_image, true_position
 from phd_exp.distributions import Density, ProjectedHuber, Temperature
 from phd_exp.distributions.along import quantiles_along
 from phd_exp.geometry.camera import Camera
@@ -299,7 +299,7 @@ def _seen(predictor: Predictor, detections: list[Detection] | UserError) -> tupl
 def _facing(predictor: Predictor, detection: Detection, size: tuple[int, int]) -> VirtualCamera:
     """The camera of the view of a detection. Raises DatasetError as `data.crops.facing`."""
     box = detection.box(*size)
-    K, lens = optics_of(detection, size)
+    K, lens = detection.optics(*size)
     try:
         return predictor.virtual_camera(K, size, box if detection.line.box else None, lens)
     except ValueError as error:

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from phd_exp.data.crops import optics_of, read_image
+from phd_exp.data.crops import read_image
 from phd_exp.fusion import Pose
 from phd_exp.inference.following import HERE, Frame
 from phd_exp.optics.virtual import Box
@@ -91,7 +91,7 @@ def _alike(where: str, image: np.ndarray, size: tuple[int, ...] | None) -> tuple
 def frame_of(detection: Detection, image: np.ndarray, time: float, boxes: tuple[Box, ...] | None) -> Frame:
     """A frame with the camera of a detection. Raises DatasetError if it is not that of this image."""
     height, width = image.shape[:2]
-    K, lens = optics_of(detection, (width, height))
+    K, lens = detection.optics(width, height)
     pose = HERE
     if detection.line.pose:
         poses = Pose.from_scene([detection.line.pose])

@@ -297,18 +297,18 @@ def calibration(given: Any) -> Calibration | None:
         raise ValueError(f"camera: {gist(error)}") from None
     if not (camera.width and camera.height):
         raise ValueError(f"camera: {given} does not say the size of the images; add width and height to the file")
-    if camera.model != "equidistant":
-        require_narrow(camera.K[0], camera.K[4], camera.width, camera.height)
-    require_no_fold(camera.intrinsics, camera.lens, camera.width, camera.height)
+    require_possible(camera.intrinsics, camera.lens, camera.width, camera.height)
     return camera
 
 
-def require_narrow(fx: float, fy: float, width: int, height: int) -> None:
-    """Raise ValueError if images show more than `WIDEST`, which only those of a fisheye may."""
+def require_possible(K: NDArray[np.float64], lens: Lens, width: int, height: int) -> None:
+    """Raise ValueError if a lens folds over inside an image, or one without a fisheye shows more than `WIDEST`."""
+    fx, fy = np.diagonal(K)[:2]
     angle = math.degrees(2 * math.atan(max(width / fx, height / fy) / 2))
-    if angle > WIDEST:
+    if angle > WIDEST and not lens.is_fisheye:
         raise ValueError(
             f"with a focal length of {fx:g} x {fy:g} pixels, an image of {width} x {height} pixels shows {angle:.0f} "
             f"degrees; expected at most {WIDEST}; f in millimetres must be divided by the size of a pixel in "
             "millimetres"
         )
+    require_no_fold(K, lens, width, height)

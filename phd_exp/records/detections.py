@@ -9,9 +9,13 @@ from os.path import commonpath
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
+from jaxtyping import Float
 from pydantic import Field, PlainValidator, ValidationError, model_validator
 
-from phd_exp.records.cameras import CORNER, SHORTEST, Calibration, Size, read_camera, require_narrow
+from phd_exp.optics.lens import PINHOLE, Lens
+from phd_exp.optics.virtual import intrinsics
+from phd_exp.records.cameras import SHORTEST, Calibration, Size, read_camera, require_possible
 from phd_exp.records.errors import DatasetError, complaint
 from phd_exp.records.images import content_of
 from phd_exp.records.parsing import Record
@@ -145,10 +149,11 @@ class Detection:
             raise DatasetError(f"{self.where}: x, y, z are missing; training and testing need the true position")
         return x, y, z
 
-    def focal_lengths_and_centre(self, width: int, height: int) -> tuple[float, float, float, float]:
-        """fx, fy, cx, cy for an image of that size, px.
+    def optics(self, width: int, height: int) -> tuple[Float[np.ndarray, "3 3"], Lens]:
+        """The camera matrix (px from the corner of the first pixel) and the lens, for an image of that size, px.
 
-        Raises DatasetError if the line or the camera file is for another size, or the image would show too much.
+        Raises DatasetError if the line or the camera file is for another size, the image would show too much, or its
+        lens folds over inside.
         """
         line, file = self.line, self.calibration
         for name, given in (("", line), (f"camera={line.camera}: ", file)):
@@ -157,18 +162,14 @@ class Detection:
                     f"{self.where}: {name}is for images of {given.width} x {given.height} pixels; this image has "
                     f"{width} x {height}; scale image, size, camera and boxes alike"
                 )
-        if file:
-            fx, fy, cx, cy = file.K[0], file.K[4], file.K[2] + CORNER, file.K[5] + CORNER
-        else:
-            fx, fy = (value for value in (line.f or line.fx, line.f or line.fy) if value)  # a line has f or both
-            cx = width / 2 if line.cx is None else line.cx
-            cy = height / 2 if line.cy is None else line.cy
+        fx, fy = line.f or line.fx or 0.0, line.f or line.fy or 0.0  # a line without a file has f or both
+        cx, cy = width / 2 if line.cx is None else line.cx, height / 2 if line.cy is None else line.cy
+        K, lens = (file.intrinsics, file.lens) if file else (intrinsics(fx, fy, cx, cy), PINHOLE)
         try:
-            if not (file and file.model == "equidistant"):
-                require_narrow(fx, fy, width, height)
+            require_possible(K, lens, width, height)
         except ValueError as error:
             raise DatasetError(f"{self.where}: {error}") from None
-        return fx, fy, cx, cy
+        return K, lens
 
     def box(self, width: int, height: int) -> tuple[float, float, float, float]:
         """The box in an image of that size, px. Raises DatasetError if it lies outside the image or is too large."""
@@ -195,8 +196,9 @@ def detections_of(
 
     Examples:
         >>> (detection,) = detections_of([Path("photo.jpg")], {"f": 900.0})
-        >>> detection.focal_lengths_and_centre(640, 480)
-        (900.0, 900.0, 320.0, 240.0)
+        >>> K, lens = detection.optics(640, 480)
+        >>> K[:2, 2].tolist()
+        [320.0, 240.0]
     """
     named = [({"file_name": name, **camera}, file) for name, file in zip(_names(files), files, strict=True)]
     lines = [(line_of({**values, **box}, str(file)), file) for values, file in named for box in boxes]

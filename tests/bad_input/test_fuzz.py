@@ -90,7 +90,7 @@ def test_annotations_of_images(tmp_path: Path, name: str, examples: int) -> None
             for detection in detections_in(folder):
                 assert detection.file.resolve().is_relative_to(folder.resolve())
                 with suppress(UserError):
-                    detection.focal_lengths_and_centre(100, 100)
+                    detection.optics(100, 100)
                     detection.box(100, 100)
         file.write_bytes(goods[file])
 

@@ -265,7 +265,7 @@ def test_a_camera_is_that_of_the_pixels_that_are_read_out(tmp_path: Path, name: 
     shot = compressed(png(picture), "png", START) if is_compressed else image(picture, "rgb8", START)
     write(tmp_path / "a.mcap", [info(*SENSOR, START, **fields), shot])
     (found,) = Recording.of(tmp_path / "a.mcap", None, {})
-    fx, fy, cx, cy = found.focal_lengths_and_centre(width, height)
+    (fx, _, cx), (_, fy, cy), _ = found.optics(width, height)[0]
     xyz = np.array([0.3, -0.2, 2.0])
     on_sensor = 410 * xyz[1] / xyz[2] + 70.5
     assert bin_y * (cy + fy * xyz[1] / xyz[2]) + y == pytest.approx(on_sensor)

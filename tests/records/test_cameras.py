@@ -212,12 +212,12 @@ FISHEYE = CAMERA._replace(model=KB, D=[-0.03, 0.004, -0.002, 0.0003])
 def test_pixels_count_from_the_corner_and_the_size_must_be_that_of_the_image(file: Path) -> None:
     read(file, ros(CAMERA))
     (detection,) = detections_of([Path("photo.jpg")], {"camera": str(file)})
-    assert detection.focal_lengths_and_centre(640, 480) == (400.5, 401.2, 320, 240)
+    assert detection.optics(640, 480)[0].tolist() == [[400.5, 0, 320], [0, 401.2, 240], [0, 0, 1]]
     with pytest.raises(DatasetError, match=r"photo\.jpg: camera=.*: is for images of 640 x 480 .* has 320 x 240"):
-        detection.focal_lengths_and_centre(320, 240)
+        detection.optics(320, 240)
     read(file, ros(CAMERA, image_width=None, image_height=None))
     (detection,) = detections_of([Path("photo.jpg")], {"camera": str(file)})
-    assert detection.focal_lengths_and_centre(320, 240) == (400.5, 401.2, 320, 240)
+    assert detection.optics(320, 240)[0][0, 0] == 400.5
 
 
 @pytest.mark.parametrize("suffix", [".yml", ".xml", ".json"])
@@ -234,13 +234,13 @@ def test_a_file_that_opencv_writes_now(file: Path, suffix: str) -> None:
 
 def test_a_focal_length_in_millimetres_is_refused_unless_the_lens_is_a_fisheye(file: Path) -> None:
     with pytest.raises(DatasetError, match=r"photo\.jpg: .*18 x 18 pixels.* shows 174 degrees; .*f in millimetres"):
-        detections_of([Path("photo.jpg")], {"f": 18.0})[0].focal_lengths_and_centre(640, 480)
+        detections_of([Path("photo.jpg")], {"f": 18.0})[0].optics(640, 480)
     wide, fisheye = (ros(camera._replace(fx=80.0, fy=80.0)) for camera in (CAMERA, FISHEYE))
     read(file, fisheye)
-    assert detections_of([Path("a")], {"camera": str(file)})[0].focal_lengths_and_centre(640, 480)[0] == 80
+    assert detections_of([Path("a")], {"camera": str(file)})[0].optics(640, 480)[0][0, 0] == 80
     read(file, wide)
     with pytest.raises(DatasetError, match="shows 152 degrees; expected at most 150"):
-        detections_of([Path("a")], {"camera": str(file)})[0].focal_lengths_and_centre(640, 480)
+        detections_of([Path("a")], {"camera": str(file)})[0].optics(640, 480)
 
 
 F = dict(zip(("fx", "fy", "cx", "cy"), CAMERA, strict=False))

@@ -45,9 +45,9 @@ def test_what_is_said_stands_and_what_is_left_out_follows_from_the_image(
 ) -> None:
     camera = {"fx": 800, "fy": 810.5, "cx": 0, "cy": -3.5, "box": [1, 2, 3.5, 4]}
     plain, full = read(GOOD, {"file_name": "b/c.jpg"} | camera | PLACED)
-    assert plain.focal_lengths_and_centre(640, 481) == (900, 900, 320, 240.5)
+    assert plain.optics(640, 481)[0].tolist() == [[900, 0, 320], [0, 900, 240.5], [0, 0, 1]]
     assert (plain.box(640, 481), plain.position) == ((0, 0, 640, 481), (0.1, -0.2, 4))
-    assert full.focal_lengths_and_centre(640, 480) == (800, 810.5, 0, -3.5)
+    assert full.optics(640, 480)[0].tolist() == [[800, 0, 0], [0, 810.5, -3.5], [0, 0, 1]]
     assert (full.box(640, 480), full.file) == ((1, 2, 3.5, 4), folder.root / "train" / "b" / "c.jpg")
 
 

@@ -42,9 +42,8 @@ def test_bop_positions_project_as_its_equation_says(read: Callable, tmp_path: Pa
         t = np.array(BOP["scene_gt.json"][name][number]["cam_t_m2c"])
         np.testing.assert_allclose(np.array(detection.position) * 1000, t, rtol=1e-15)
         u, v, s = np.reshape(BOP["scene_camera.json"][name]["cam_K"], (3, 3)) @ t
-        fx, fy, cx, cy = detection.focal_lengths_and_centre(120, 90)
-        x, y, z = detection.position
-        np.testing.assert_allclose((cx + fx * x / z, cy + fy * y / z), (u / s + 0.5, v / s + 0.5), rtol=1e-12)
+        pixel = detection.optics(120, 90)[0] @ detection.position
+        np.testing.assert_allclose(pixel[:2] / pixel[2], (u / s + 0.5, v / s + 0.5), rtol=1e-12)
     assert [detection.file for detection in found] == [
         tmp_path / "test/000002/rgb" / name for name in ("000000.png", "000003.jpg", "000003.jpg")
     ]
@@ -67,13 +66,13 @@ def test_bop_cameras_with_poses_form_scenes_of_one_object_each(read: Callable) -
 def test_coco_boxes_cameras_positions_and_sizes(read: Callable) -> None:
     cup, spoon = read("coco")
     assert cup.box(120, 90) == (10.5, 20, 40.5, 60)
-    assert cup.focal_lengths_and_centre(120, 90) == (100, 101, 61, 44)
-    assert spoon.focal_lengths_and_centre(120, 90) == (110, 110, 60, 45)
+    assert cup.optics(120, 90)[0].tolist() == [[100, 0, 61], [0, 101, 44], [0, 0, 1]]
+    assert spoon.optics(120, 90)[0].tolist() == [[110, 0, 60], [0, 110, 45], [0, 0, 1]]
     assert (cup.position, spoon.line.z) == ((0.1, 0, 2), None)
     with pytest.raises(
         DatasetError, match="annotation 1: is for images of 120 x 90 pixels; this image has 121 x 90;"
     ):
-        spoon.focal_lengths_and_centre(121, 90)
+        spoon.optics(121, 90)
 
 
 @pytest.mark.parametrize(

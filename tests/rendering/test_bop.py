@@ -98,7 +98,11 @@ def test_detections_return(folder: DatasetFolder, bop: Path) -> None:
                 assert record.visibility == 0
                 continue
             np.testing.assert_allclose(detection.position, (record.x, record.y, record.z), atol=1e-9, rtol=0)
-            assert detection.focal_lengths_and_centre(SIDE, SIDE) == (record.f, record.f, SIDE / 2, SIDE / 2)
+            assert detection.optics(SIDE, SIDE)[0].tolist() == [
+                [record.f, 0, SIDE / 2],
+                [0, record.f, SIDE / 2],
+                [0, 0, 1],
+            ]
             assert detection.line.scale == record.scale
             assert detection.line.visibility == pytest.approx(record.visibility * (1 - record.truncation))
             assert detection.file.read_bytes() == (folder.split_folder(split) / record.file_name).read_bytes()
