@@ -7,6 +7,7 @@ import sysconfig
 import traceback
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_args, get_origin
 
@@ -71,23 +72,27 @@ def writing(folder: Path, instead: str = "data.root", kind: type[UserError] = Re
         ) from error
 
 
-@contextmanager
-def reading(
-    where: object, otherwise: str = "", kind: type[UserError] = DatasetError, what: str = "cannot be read"
-) -> Iterator[None]:
+@dataclass(eq=False)
+class reading:  # noqa: N801 - used as contextlib.suppress
     """Convert any error in the body, which reads a file of others, to a UserError of a `kind`, one line.
 
     The line has the place, the reason, and a remedy: `otherwise`, but READABLE if the system refuses to read. A
     UserError passes unchanged. Parsers raise errors of many kinds on damaged files, hence `Exception`.
     """
-    try:
-        yield
-    except UserError:
-        raise
-    except Exception as error:
-        refused = isinstance(error, OSError) and error.errno and not isinstance(error, FileNotFoundError)
-        remedy = f"; {READABLE if refused else otherwise}" if otherwise else ""
-        raise kind(f"{where}: {what} ({one_line(gist(error))}){remedy}") from error
+
+    where: object
+    otherwise: str = ""
+    kind: type[UserError] = DatasetError
+    what: str = "cannot be read"
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, _: object, error: BaseException | None, __: object) -> None:
+        if isinstance(error, Exception) and not isinstance(error, UserError):
+            refused = isinstance(error, OSError) and error.errno and not isinstance(error, FileNotFoundError)
+            remedy = f"; {READABLE if refused else self.otherwise}" if self.otherwise else ""
+            raise self.kind(f"{self.where}: {self.what} ({one_line(gist(error))}){remedy}") from error
 
 
 def listed(names: Sequence[str]) -> str:

@@ -13,7 +13,7 @@ from itertools import count
 from pathlib import Path
 from typing import TypeVar
 
-from phd_exp.records.errors import CorruptFileError, reading
+from phd_exp.records.errors import CorruptFileError, gist
 from phd_exp.records.parsing import parse_json
 
 Parsed = TypeVar("Parsed")
@@ -141,8 +141,10 @@ def read_jsonl(
             line = stream.readline(LONGEST_LINE + 1)
             if not line.endswith(b"\n") and not (line and sealed) and len(line) <= LONGEST_LINE:
                 break
-            with reading(f"{path}, line {number}", kind=CorruptFileError, what="not a valid record"):
+            try:
                 if len(line) > LONGEST_LINE:
                     raise ValueError(f"longer than {LONGEST_LINE} bytes")
                 records.append(parse(line.removesuffix(b"\n").decode()))
+            except ValueError as error:  # also UnicodeDecodeError and pydantic's ValidationError
+                raise CorruptFileError(f"{path}, line {number}: not a valid record ({gist(error)})") from error
     return records
