@@ -82,18 +82,16 @@ class Recording:
         topics = dict(counts.keys())
         name, _, given = (topic or "").partition(",")
         images = _chosen(path, name, [one for one, kind in topics.items() if kind in (RAW, COMPRESSED)])
-        infos, calibration = None, None
+        infos, calibration, (time, message) = None, None, _first(path, images)
         if camera.keys() <= {"box"}:
             infos = _info_of(path, images, given, [one for one, kind in topics.items() if kind == INFO])
-            size = _size_of(_first(path, images)[1])
-            calibration = _calibration(path, images, infos, _first(path, infos)[1], size)
+            calibration = _calibration(path, images, infos, _first(path, infos)[1], _size_of(message))
             camera = {"camera": infos, **camera}
         elif "camera" in camera:
             calibration = read_camera(Path(camera["camera"]))
         line = line_of({"file_name": images, **camera}, str(path))
         n = counts[images, topics[images]]
         template = Detection(line, path, str(path), calibration)
-        time, message = _first(path, images)
         return cls(path, images, template, infos, n, _time(message, time), str(message.header.frame_id))
 
     def __len__(self) -> int:

@@ -261,19 +261,17 @@ class RunFolder:
             machine=machine(),
         )
 
-        def ended(state: State, **details: str) -> None:
+        def ended(state: State, **details: str | None) -> None:
             self.write_status(status.model_copy(update={"state": state, "ended": datetime.now(UTC), **details}))
 
         self.write_status(status)
         try:
             yield
         except BaseException as error:
-            line = f"{type(error).__name__}: {error}"
+            lines = traceback.format_exc() if isinstance(error, Exception) else None
             with suppress(OSError):  # on a full disk, the first error is the one to raise
-                if isinstance(error, Exception):
-                    ended("failed", error=line, traceback=traceback.format_exc())
-                else:
-                    ended("interrupted", error=line)
+                state: State = "failed" if lines else "interrupted"
+                ended(state, error=f"{type(error).__name__}: {error}", traceback=lines)
             raise
         ended("finished")
 
