@@ -49,11 +49,7 @@ def verify(folder: DatasetFolder, spec: DatasetSpec, rerender: int, seed: int | 
         )
     wrong: list[str] = []
     sound: list[SampleRecord] = []
-    records: list[SampleRecord] = []
-    for split in SPLITS:
-        found, faults = _metadata(folder, split, manifest.splits.get(split))
-        records += found
-        wrong += [*faults, *_strangers(folder, split, found)]
+    records = [record for split in SPLITS for record in _metadata(folder, split, manifest.splits.get(split), wrong)]
     with shown_progress(len(records), f"verifying {spec.variant}") as advance:
         for record in records:
             path = folder.split_folder(record.split) / record.file_name
@@ -70,25 +66,21 @@ def verify(folder: DatasetFolder, spec: DatasetSpec, rerender: int, seed: int | 
     return len(sound)
 
 
-def _metadata(folder: DatasetFolder, split: Split, seal: Seal | None) -> tuple[list[SampleRecord], list[str]]:
-    """The records of a split, and the faults of their file."""
+def _metadata(folder: DatasetFolder, split: Split, seal: Seal | None, wrong: list[str]) -> list[SampleRecord]:
+    """The records of a split. Faults of their file, and images without a line, are added to `wrong`."""
     if seal is None or not seal.n:
-        return [], []
-    path, faults = folder.metadata_path(split), []
+        return []
+    path, records = folder.metadata_path(split), list[SampleRecord]()
     if path.exists() and checksum(path) != seal.metadata_sha256:
-        faults.append(f"{path}: its checksum is not that of the manifest; restore it, or render the data set anew")
+        wrong.append(f"{path}: its checksum is not that of the manifest; restore it, or render the data set anew")
     try:
-        return folder.records(split), faults
+        records = folder.records(split)
     except UserError as error:
-        return [], [*faults, str(error)]
-
-
-def _strangers(folder: DatasetFolder, split: Split, records: list[SampleRecord]) -> Iterator[str]:
-    """Images without a line of metadata, which image loaders would take for samples."""
-    if not records or side_files(folder, split):
-        return  # a render that is running or was interrupted has images that are not sealed yet
-    for name in sorted(folder.images(split) - {record.file_name for record in records}):
-        yield f"{folder.split_folder(split) / name}: no line of metadata.jsonl names it; delete it"
+        wrong.append(str(error))
+    if records and not side_files(folder, split):  # a render under way has images that are not sealed yet
+        for name in sorted(folder.images(split) - {record.file_name for record in records}):
+            wrong.append(f"{folder.split_folder(split) / name}: no line of metadata.jsonl names it; delete it")
+    return records
 
 
 def _rendered_again(folder: DatasetFolder, spec: DatasetSpec, records: list[SampleRecord]) -> Iterator[str]:

@@ -15,7 +15,7 @@ from phd_exp.rendering.boxes import beside, view_of_box
 from phd_exp.rendering.importing import in_blenders_axes
 from phd_exp.rendering.looks import varied
 from phd_exp.rendering.rays import rotation_matrix
-from phd_exp.rendering.resting import rests_of
+from phd_exp.rendering.resting import resting_turn
 from phd_exp.rendering.sampling import (
     MOST_TRIES,
     SIZE,
@@ -89,7 +89,7 @@ def _lying(
     if spec.upright or spec.resting:
         rotation = upright_rotation(around.pitch, turn)
     if spec.resting:
-        onto_side = rests_of(mesh).draw(rng)
+        onto_side = resting_turn(mesh, rng)
         rotation = quaternion_of(rotation_of(rotation) * onto_side)
         upwards = product(upwards, onto_side.as_matrix())
     return item.model_copy(update={"rotation": rotation}), upwards

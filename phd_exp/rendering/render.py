@@ -84,7 +84,7 @@ def _render(
     )
     begun = time.monotonic()
     try:
-        with shown_progress(n, f"rendering {spec.variant}", min(workers, n), f"fewer images: {fewer}") as advance:
+        with shown_progress(n, f"rendering {spec.variant}", f"fewer images: {fewer}") as advance:
             for waits in (False, True):
                 elsewhere = []
                 with closing(render_all(folder, spec, by_sky(spec, samples), workers, waits=waits)) as made:

@@ -1,6 +1,5 @@
 """How an object can lie on a table: on which of its sides it comes to rest, and how often."""
 
-from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
@@ -16,22 +15,14 @@ FEWEST = 4  # vertices of a hull
 JOGGLED = "QJ"  # Qhull moves vertices by rounding errors, so that flat meshes have a hull too
 
 
-@dataclass(frozen=True)
-class Rests:
-    """The stable sides of an object.
+Rests = tuple[Float[np.ndarray, "sides 3"], Float[np.ndarray, " sides"]]
+"""Outward unit normals of the stable sides of an object, in its local frame, and the share of each; the sum is 1."""
 
-    Args:
-        down: outward unit normals of the sides, in the local frame.
-        share: how often the object comes to rest on each; the sum is 1.
-    """
 
-    down: Float[np.ndarray, "sides 3"]
-    share: Float[np.ndarray, " sides"]
-
-    def draw(self, rng: np.random.Generator) -> Rotation:
-        """The rotation that turns a random side down, to -z of a frame whose z axis points up."""
-        side = rng.choice(len(self.share), p=self.share)
-        return Rotation.align_vectors([UP], [-self.down[side]])[0]
+def resting_turn(mesh: Triangles, rng: np.random.Generator) -> Rotation:
+    """The rotation that turns a random stable side of an object down, to -z of a frame whose z axis points up."""
+    down, share = rests_of(mesh)
+    return Rotation.align_vectors([UP], [-down[rng.choice(len(share), p=share)]])[0]
 
 
 @cache  # of each mesh, which is the same for every picture
@@ -53,7 +44,7 @@ def rests_of(mesh: Triangles) -> Rests:
     down = hull.equations[:, :3]
     share = np.bincount(_rolled(corners, down, hull.neighbors), _solid_angles(corners), len(down))
     sides = np.flatnonzero(share)
-    return Rests(down[sides], share[sides] / share.sum())
+    return down[sides], share[sides] / share.sum()
 
 
 def _rolled(

@@ -47,13 +47,6 @@ def test_contains(xyz: tuple[float, ...], inside: bool) -> None:
     assert bool(camera(1500.0).contains(torch.tensor(xyz, dtype=torch.float64))) is inside
 
 
-@pytest.mark.parametrize("factor", [0.5, 2.0])
-def test_pixels_of_a_resized_image_move_in_proportion(factor: float) -> None:
-    resized = Camera(factor * CAMERA.f, factor * CAMERA.S)
-    torch.testing.assert_close(resized.project(XYZ), factor * CAMERA.project(XYZ))
-    assert torch.equal(resized.contains(XYZ), CAMERA.contains(XYZ))
-
-
 def test_a_constant_focal_length_replaces_those_of_all_cameras() -> None:
     constant = CAMERA.with_constant_f(1300.0)
     assert constant.f.tolist() == [1300.0] * 3

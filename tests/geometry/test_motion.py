@@ -50,11 +50,7 @@ def test_a_position_is_seen_where_its_pixel_goes(motion: Motion, camera: Camera,
     of_all = motion.origin(seen, camera)
     back = of_all[torch.arange(N), torch.arange(N)]
     assert_close(back, from_middle(camera.project(xyz)))
-
-
-def test_distances_stay(motion: Motion, xyz: torch.Tensor) -> None:
     assert_close(motion.R @ motion.R.mT, torch.eye(3, dtype=torch.float64).expand(N, 3, 3))
-    assert_close(motion.position(xyz).norm(dim=-1), xyz.norm(dim=-1))
 
 
 def farthest(motion: Motion, camera: Camera) -> torch.Tensor:

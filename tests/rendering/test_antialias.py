@@ -31,20 +31,6 @@ def test_points_have_the_moments_of_the_filter() -> None:
     assert np.corrcoef(*filter_points())[0, 1] == pytest.approx(0, abs=1e-9)
 
 
-def test_edges_are_where_another_surface_is_near() -> None:
-    surfaces = np.zeros((9, 9), np.int8)
-    surfaces[:, 6:] = 3
-    expected = np.zeros((9, 9), dtype=bool)
-    expected[:, 4:8] = True
-    assert (edges(surfaces, 2) == expected).all()
-    assert not edges(np.full((9, 9), 5, np.int8), 2).any()
-
-
-def test_one_light_everywhere_stays_as_it_is(scene: Scene) -> None:
-    light = np.full((scene.S, scene.S, 3), 0.37)
-    assert smoothed(light, trace_pixels(scene).first, scene) == pytest.approx(light)
-
-
 def test_away_from_edges_nothing_changes(scene: Scene) -> None:
     light = np.random.default_rng(0).random((scene.S, scene.S, 3))
     surfaces = trace_pixels(scene).first

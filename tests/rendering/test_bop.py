@@ -1,7 +1,6 @@
-"""A rendered data set as BOP and back, its models against theory, and all of it by the BOP toolkit."""
+"""A rendered data set as BOP and back, and its models against theory."""
 
 import json
-from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -189,32 +188,3 @@ def test_models_have_the_volume_size_and_symmetries_of_the_solids(folder: Datase
         assert [axis["axis"] for axis in info["symmetries_continuous"]] == {
             "cylinder": [[0, 0, 1]], "cube": [], "sphere": np.eye(3).tolist()
         }[shape]  # fmt: skip
-
-
-def test_the_bop_toolkit_reads_it(folder: DatasetFolder, bop: Path) -> None:
-    reason = "the BOP toolkit (github.com/thodan/bop_toolkit) is not installed"
-    inout = pytest.importorskip("bop_toolkit_lib.inout", reason=reason)
-    scenewise = pytest.importorskip("bop_toolkit_lib.dataset.bop_scenewise", reason=reason)
-    misc = pytest.importorskip("bop_toolkit_lib.misc", reason=reason)
-    for (split, scene), group in groupby(records(folder), lambda pair: (pair[0].split, pair[1])):
-        place = bop / split / scene
-        assert scenewise.load_scene_data(place)["scene_gt"].keys() == {record.index for record, _ in group}
-    for record, scene in records(folder):
-        data = scenewise.load_image_data(
-            bop / record.split / scene, record.index, load_depth=False, load_gt=True, load_gt_info=True
-        )
-        K = [[record.f, 0, SIDE / 2 - 0.5], [0, record.f, SIDE / 2 - 0.5], [0, 0, 1]]
-        assert (data["camera"]["cam_K"] == K).all()
-        np.testing.assert_allclose(
-            data["gt"][0]["cam_t_m2c"].ravel() / 1000, (record.x, record.y, record.z), atol=1e-9
-        )
-        counts = [info["px_count_visib"] for info in data["gt_info"]]
-        assert [int((mask == 255).sum()) for mask in data["mask_visib"]] == counts
-        with Image.open(folder.split_folder(record.split) / record.file_name) as image:
-            assert (data["im_rgb"] == np.asarray(image)).all()
-    for number, info in inout.load_json(bop / "models" / "models_info.json", keys_to_int=True).items():
-        model = inout.load_ply(bop / "models" / f"obj_{number:06d}.ply")
-        extent = [info[f"{key}_{axis}"] for key in ("min", "size") for axis in "xyz"]
-        np.testing.assert_allclose(misc.calc_3d_bbox(*model["pts"].T), extent, rtol=1e-6)
-        if number <= number_of("sphere"):
-            assert len(misc.get_symmetry_transformations(info, max_sym_disc_step=0.1)) > 1

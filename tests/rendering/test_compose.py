@@ -1,7 +1,5 @@
 """Pictures show the objects where the scene says, and nothing but the backdrop elsewhere."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -11,9 +9,8 @@ from phd_exp.rendering.antialias import REACH, edges
 from phd_exp.rendering.blender import Box
 from phd_exp.rendering.pixels import encoded
 from phd_exp.rendering.rays import Hits, cylinder_mask, trace_pixels
-from phd_exp.rendering.render import ensure_rendered
 from phd_exp.rendering.samples import backdrop_light, box_around
-from tests.support.renders import MakeSpec, pixels, silhouettes
+from tests.support.renders import pixels, silhouettes
 
 
 def backdrop_pixels(record: SampleRecord) -> np.ndarray:
@@ -74,15 +71,6 @@ def test_objects_are_where_the_scene_says(rendered: DatasetFolder) -> None:
             colour = pixels(rendered, record)[cylinder].mean(axis=0)
             assert int(colour.argmax()) == int(np.argmax(record.objects[0].colour))
     assert compared >= 2
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(1200)
-def test_a_thousand_images_have_no_seam(make_spec: MakeSpec, tmp_path: Path) -> None:
-    folder = DatasetFolder(tmp_path / "occl_scale")
-    ensure_rendered(folder, make_spec("occl_scale", sensor_size=56, f_range=(300.0, 500.0)), 1000, 0)
-    for record in folder.records("train"):
-        away_from_objects(folder, record)
 
 
 def test_silhouettes_have_no_bias(centred: DatasetFolder) -> None:

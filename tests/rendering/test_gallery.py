@@ -5,11 +5,8 @@ import runpy
 from pathlib import Path
 
 import numpy as np
-import torch
 from PIL import Image
 
-from phd_exp.distributions import ProjectedHuber
-from phd_exp.distributions.level_curves import level_curves
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.spec import DatasetSpec
 
@@ -38,21 +35,3 @@ def test_the_centre_is_marked_where_the_record_says(
     with Image.open(io.BytesIO((tmp_path / "camera.png").read_bytes())) as picture:
         assert picture.height == ZOOM * record.S
         assert picture.getpixel((u, v)) == MARK
-
-
-def test_a_glance_marks_the_truth_and_explains_itself_once() -> None:
-    one = torch.tensor(1.0, dtype=torch.float64)
-    curves = level_curves(ProjectedHuber(torch.zeros(2).double(), 4 * one, 200 * torch.eye(2).double(), 20 * one))
-    row = {"x": 0.02, "y": -0.01, "z": 4.2, "f": 1500.0, "S": 224.0}
-    values = [1e-3, 1e-2, 1e-1]
-    calibration = {"predicted": values, "empirical": values, "window": 100, "left_out": 0}
-    figure = DRAW["glance"](row, np.zeros((224, 224, 3), np.uint8), curves, calibration)
-    assert all(axes.get_title() for axes in figure.axes)
-    assert [axes.get_legend() for axes in figure.axes] == [None] * 3
-    (legend,) = figure.legends
-    words = [text.get_text() for text in legend.get_texts()]
-    assert len(words) == len(set(words))
-    assert {"50 %", "90 %", "99 %", "mode", "truth", "calibrated"} <= set(words)
-    dots = [np.ravel(axes.lines[-1].get_data()) for axes in figure.axes[:2]]
-    np.testing.assert_allclose(dots[0], np.array([row["x"], row["y"]]) / row["z"] * row["f"] + row["S"] / 2)
-    np.testing.assert_allclose(dots[1], [row["x"], row["z"]])

@@ -85,11 +85,6 @@ def test_an_upright_object_is_only_turned_about_the_vertical(of_mesh: MakeSpec, 
     assert rotation_matrix(upright_rotation(0.0, 0.0))[:, 2] == pytest.approx([0, -1, 0])
 
 
-def test_cameras_look_from_below_too(of_mesh: MakeSpec, meshes: dict[str, Triangles]) -> None:
-    pitches = [s.surroundings.pitch for s in drawn(of_mesh(pitch_range=(-90, 90)), 300, meshes) if s.surroundings]
-    assert stats.kstest(np.degrees(pitches), stats.uniform(-90, 180).cdf).pvalue > UNLIKELY
-
-
 def test_test_images_have_other_skies_and_skies_replace_the_lamps(
     of_mesh: MakeSpec, meshes: dict[str, Triangles]
 ) -> None:
@@ -351,35 +346,15 @@ def test_a_glowing_material_does_not_depend_on_the_sky(make_spec: MakeSpec, tmp_
     assert (dim[1], bright[1]) == (pytest.approx(3, rel=0.1), pytest.approx(3, rel=0.3))
 
 
-def write_ball(folder: Path, side: int = 160) -> Path:
-    """A bumpy ball of 2 side^2 triangles with a texture of tiles."""
-    rng, turns = np.random.default_rng(0), np.linspace(0, 1, side + 1)
-    u, v = (grid.ravel() for grid in np.meshgrid(turns, turns))
-    around, down = 2 * np.pi * u, np.pi * v
-    directions = np.stack([np.cos(around) * np.sin(down), np.cos(down), np.sin(around) * np.sin(down)], axis=1)
-    points = 0.1 * directions * (1 + 0.1 * np.prod(np.sin(directions * (7, 5, 6)), axis=1, keepdims=True))
-    first = (np.arange(side)[:, None] * (side + 1) + np.arange(side)).ravel() + 1
-    faces = np.concatenate([first[:, None] + [0, 1, side + 1], first[:, None] + [1, side + 2, side + 1]])
-    lines = ["mtllib ball.mtl", "usemtl tiles", "s 1"]
-    lines += [f"v {x:.6f} {y:.6f} {z:.6f}" for x, y, z in points]
-    lines += [f"vt {a:.6f} {b:.6f}" for a, b in zip(u, v, strict=True)]
-    lines += [f"f {a}/{a} {b}/{b} {c}/{c}" for a, b, c in faces]
-    (folder / "ball.obj").write_text("\n".join(lines) + "\n")
-    (folder / "ball.mtl").write_text("newmtl tiles\nmap_Kd tiles.png\nNs 60\n")
-    Image.fromarray(np.kron(rng.integers(40, 230, (24, 24, 3)), np.ones((16, 16, 1))).astype(np.uint8)).save(
-        folder / "tiles.png"
-    )
-    return folder / "ball.obj"
-
-
 @pytest.mark.slow
-def test_fifty_thousand_faces_take_a_sixtieth_of_1024_samples_at_38_decibels(
+def test_thirty_thousand_faces_take_a_sixtieth_of_1024_samples_at_38_decibels(
     make_spec: MakeSpec, tmp_path: Path
 ) -> None:
     """In processor time of this run: seconds would depend on the machine."""
-    spec = make_spec("object", mesh=str(write_ball(tmp_path)), xy_range=0.5)
+    file = write_mesh(tmp_path / "ball.ply", solid("sphere"))
+    spec = make_spec("object", mesh=str(file), xy_range=0.5)
     renderer = Renderer(fast_settings(spec), spec)
-    assert len(renderer.meshes["mesh"].corners) >= 50_000
+    assert len(renderer.meshes["mesh"].corners) >= 30_000
     make_sample(renderer, spec, "train", 9)  # compiles and loads
 
     def made(by: Renderer) -> tuple[list[np.ndarray], float]:

@@ -11,14 +11,10 @@ import pytest
 import phd_exp
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.masks import clearing, mask
-from phd_exp.rendering.objects import sample_object_scene
-from phd_exp.rendering.rays import trace_pixels
-from phd_exp.rendering.samples import describe
-from phd_exp.rendering.sampling import sample_scene
 from phd_exp.rendering.triangles import NO_MESHES
 from tests.rendering.test_boxes import CAMERA, FISHEYE
 from tests.support.meshes import solid
-from tests.support.renders import ROOT, MakeSpec
+from tests.support.renders import ROOT, MakeSpec, described
 
 MOVING = {"camera_speed": 0.3, "camera_turn": 8.0, "frames": 3}
 LYING = {"ground": True, "pitch_range": (20.0, 40.0), "copies": 2}
@@ -32,9 +28,7 @@ def records(specs: list[str]) -> str:
     for spec in map(DatasetSpec.model_validate_json, specs):
         meshes = {"mesh": solid("cylinder")} if spec.mesh else NO_MESHES
         for index in range(4):
-            draw = [spec, "train", index]
-            scene = sample_object_scene(*draw, meshes) if spec.mesh else sample_scene(*draw)
-            record = describe(*draw, scene, trace_pixels(scene, meshes), "0" * 64, meshes)
+            record = described(spec, "train", index, meshes)
             lines.append(f"{record.model_dump_json()} {mask(record, meshes).sum()} {clearing(record, meshes).sum()}")
     return "\n".join(lines)
 

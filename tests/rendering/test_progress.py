@@ -1,63 +1,52 @@
-"""Progress in a log file: a line now and then, and one at the end; no time before it can be measured."""
+"""Progress in a log file: a line now and then, and one at the end; a forecast as soon as the speed is known."""
 
+import re
 from collections.abc import Iterable
 
 import pytest
 
 from phd_exp.rendering import progress
-from phd_exp.rendering.progress import FEWEST, PATIENCE, Forecast, shown_progress
+from phd_exp.rendering.progress import LONG, shown_progress
 
 
 @pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
-    """The time that progress reads; its last value is now."""
+def advanced(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    """What is printed while images are done at these seconds, of n images."""
     now = [0.0]
     monkeypatch.setattr(progress.time, "monotonic", lambda: now[-1])
-    return now
+
+    def lines(moments: Iterable[float], n: int, remedy: str = "") -> list[str]:
+        with shown_progress(n, "rendering default", remedy) as advance:
+            for moment in moments:
+                now.append(moment)
+                advance()
+        return capsys.readouterr().err.splitlines()
+
+    return lines
 
 
-def advanced(clock: list[float], times: Iterable[float], n: int, **options: object) -> None:
-    with shown_progress(n, "rendering default", **options) as advance:  # type: ignore[arg-type]
-        for moment in times:
-            clock.append(moment)
-            advance()
-
-
-def test_lines_come_every_ten_seconds_and_at_the_end(clock: list[float], capsys: pytest.CaptureFixture[str]) -> None:
-    advanced(clock, range(4, 28, 4), 6)
-    assert capsys.readouterr().err.splitlines() == [
-        "rendering default: 4/6 images, 0.2 images/s, about 8 s left",
-        "rendering default: 6/6 images, 0.2 images/s",
-    ]
+def test_lines_come_every_ten_seconds_and_at_the_end(advanced) -> None:
+    lines = advanced((60.0 + 2 * image for image in range(20)), 20)
+    counts = [int(re.match(r"rendering default: (\d+)/20 images, 0\.5 images/s", line)[1]) for line in lines]
+    assert counts == [8, 13, 18, 20]
+    assert "about 24 s left" in lines[0]
+    assert "left" not in lines[-1]
+    assert advanced([200.0], 1) == ["rendering default: 1/1 images"], "too few to measure a speed"
 
 
 @pytest.mark.parametrize("processes", [1, 2, 8])
 @pytest.mark.parametrize("seconds", [0.02, 2.0, 9.0])
-def test_the_forecast_is_right_within_a_factor_of_two(clock: list[float], processes: int, seconds: float) -> None:
+def test_the_first_forecast_is_right_within_a_factor_of_two(advanced, processes: int, seconds: float) -> None:
     """Blender starts for 60 s, the first image of each process takes five times as long, images vary by a half."""
-    n, moments = 4000, []
-    for worker in range(processes):
-        moment = 60.0 + 5 * seconds + 0.01 * worker
-        for image in range(n // processes):
-            moments.append(moment)
-            moment += seconds * (0.5 + (image * 0.618 + worker * 0.3) % 1)
-    moments.sort()
-    forecast, forecasts = Forecast(n, processes), 0
-    for moment in moments:
-        clock.append(moment)
-        forecast.count()
-        truth = moments[-1] - moment
-        if forecast.left is not None and truth > 10 * seconds:
-            forecasts += 1
-            assert truth / 2 < forecast.left < 2 * truth
-        early = forecast.done < (1 + FEWEST) * processes or moment < moments[processes - 1] + PATIENCE
-        assert (forecast.left is None) == early or forecast.done == n
-    assert forecasts > 100
-
-
-def test_a_long_render_names_the_smaller_choice_once(clock: list[float], capsys: pytest.CaptureFixture[str]) -> None:
-    advanced(clock, (60.0 + 2 * image for image in range(12)), 4000, remedy="fewer images: preset=demo")
-    text = capsys.readouterr().err
-    assert text.count("about 2.2 h left; fewer images: preset=demo") == 1
-    advanced(clock, (60.0 + 2 * image for image in range(12)), 100, remedy="fewer images: preset=demo")
-    assert "preset=demo" not in capsys.readouterr().err
+    n = 5_000_000
+    starts = [60.0 + 5 * seconds + 0.01 * worker for worker in range(processes)]
+    moments = sorted(
+        start + seconds * (image + (image * 0.618 + worker * 0.3) % 1 / 2)
+        for worker, start in enumerate(starts)
+        for image in range(400)
+    )
+    long, *_ = (line for line in advanced(moments, n, "fewer images") if "fewer images" in line)
+    left = float(re.match(r"about ([\d.]+) h left; fewer images$", long)[1]) * 3600
+    assert n * seconds / processes / 2 < left < 2 * n * seconds / processes
+    assert left > LONG
+    assert not any("fewer" in line for line in advanced(moments[:20], 20, "fewer images"))

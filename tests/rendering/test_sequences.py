@@ -7,11 +7,9 @@ from scipy.spatial.transform import Rotation
 
 from phd_exp.records.scenes import SceneObject
 from phd_exp.records.spec import DatasetSpec
-from phd_exp.rendering.rays import in_camera_frame, rotation_matrix, trace_pixels
-from phd_exp.rendering.samples import describe
+from phd_exp.rendering.rays import in_camera_frame, rotation_matrix
 from phd_exp.rendering.sampling import sample_scene
-from phd_exp.rendering.triangles import NO_MESHES
-from tests.support.renders import UNLIKELY, MakeSpec
+from tests.support.renders import UNLIKELY, MakeSpec, described
 
 SEQUENCES, FRAMES = 150, 25
 SHOWN = (0, 1, 7, FRAMES - 1)
@@ -94,28 +92,23 @@ def test_a_moving_camera_sees_the_same_path_from_known_poses(make_spec: MakeSpec
     moving = spec.model_copy(update=MOVING_CAMERA)
     for index in range(16):
         np.testing.assert_allclose(in_camera(moving, index), in_camera(spec, index), atol=1e-9)
-        records = [described(one, index) for one in (spec, moving)]
+        records = [described(one, "test", index) for one in (spec, moving)]
         assert abs(records[0].visibility - records[1].visibility) < 0.2
         panel = records[1].objects[-1]
         turned = rotation_matrix(records[1].pose.rotation) @ rotation_matrix(panel.rotation)
         np.testing.assert_allclose(turned[2], [0, 0, 1], atol=1e-9)
 
 
-def described(spec: DatasetSpec, index: int):
-    scene = sample_scene(spec, "test", index)
-    return describe(spec, "test", index, scene, trace_pixels(scene), "0" * 64, NO_MESHES)
-
-
 def test_a_record_has_the_name_of_its_sequence_its_time_and_its_pose(make_spec: MakeSpec) -> None:
     spec = make_spec("sequence", frames=4, frame_rate=8.0, **MOVING_CAMERA)
-    records = [described(spec, index) for index in range(8)]
+    records = [described(spec, "test", index) for index in range(8)]
     assert [record.track for record in records] == ["0"] * 4 + ["1"] * 4
     assert [record.time for record in records] == [0, 0.125, 0.25, 0.375] * 2
     assert [record.scene for record in records] == list(range(8)), "lines of one scene are of one time"
     for record in records:
         R, t = rotation_matrix(record.pose.rotation), np.array(record.pose.translation)
         np.testing.assert_allclose(R @ record.objects[0].position + t, (record.x, record.y, record.z), atol=1e-12)
-    single = described(make_spec(), 0).model_dump()
+    single = described(make_spec(), "test", 0).model_dump()
     assert not single.keys() & {"track", "time"}, "records of single images stay as they were"
 
 
@@ -141,7 +134,7 @@ def test_a_further_camera_follows_the_cylinder_and_sees_the_same_scene(make_spec
     assert 3 <= depth.min() < depth.max() <= 5
     steps = np.diff(np.array(places).reshape(10, 6, 3), axis=1)
     assert 0.001 < np.abs(steps).max() < 0.5
-    record = described(spec, 15)
+    record = described(spec, "test", 15)
     assert (record.track, record.time, record.scene, record.view) == ("1", 1 / 30, 7, 1)
 
 

@@ -7,13 +7,10 @@ import pytest
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
-from phd_exp.records.scenes import SampleRecord, Scene, Split
+from phd_exp.records.scenes import Scene
 from phd_exp.records.spec import DatasetSpec
-from phd_exp.rendering.rays import trace_pixels
-from phd_exp.rendering.samples import describe
 from phd_exp.rendering.sampling import CLEARANCE, sample_scene
-from phd_exp.rendering.triangles import NO_MESHES
-from tests.support.renders import UNLIKELY, MakeSpec
+from tests.support.renders import UNLIKELY, MakeSpec, described
 
 SCENES, VIEWS = 200, 4
 
@@ -41,11 +38,6 @@ def places(scene: Scene) -> np.ndarray:
     return np.array([item.position for item in scene.objects]) @ matrix.T + shift
 
 
-def told(spec: DatasetSpec, split: Split, index: int) -> SampleRecord:
-    scene = sample_scene(spec, split, index)
-    return describe(spec, split, index, scene, trace_pixels(scene), "0" * 64, NO_MESHES)
-
-
 def test_the_first_view_is_the_sample_of_scale(spec: DatasetSpec, make_spec: MakeSpec) -> None:
     scale = make_spec("scale")
     assert spec.views == VIEWS
@@ -57,10 +49,10 @@ def test_the_first_view_is_the_sample_of_scale(spec: DatasetSpec, make_spec: Mak
 def test_a_record_holds_the_position_before_its_own_camera(spec: DatasetSpec) -> None:
     """(x, y, z) = R p + t; number of the scene and of the view are those of the index."""
     for index in range(12):
-        record = told(spec, "test", index)
+        record = described(spec, "test", index)
         assert (record.x, record.y, record.z) == pytest.approx(tuple(places(record.as_scene)[0]), abs=1e-12)
         assert (record.scene, record.view) == (index // VIEWS, index % VIEWS)
-        assert record.objects == told(spec, "test", VIEWS * record.scene).objects
+        assert record.objects == described(spec, "test", VIEWS * record.scene).objects
 
 
 def test_views_share_the_scene_and_nothing_of_the_camera(seen: list[list[Scene]]) -> None:

@@ -17,9 +17,11 @@ from phd_exp.records.dataset import SPLITS, DatasetFolder
 from phd_exp.records.scenes import SampleRecord, Scene, SceneObject, Split
 from phd_exp.records.spec import DatasetSpec, Shard
 from phd_exp.rendering.objects import sample_object_scene
-from phd_exp.rendering.rays import NOTHING, Hits, Mask
+from phd_exp.rendering.rays import NOTHING, Hits, Mask, trace_pixels
+from phd_exp.rendering.samples import describe
+from phd_exp.rendering.sampling import sample_scene
 from phd_exp.rendering.sealing import side_file, side_files
-from phd_exp.rendering.triangles import Meshes
+from phd_exp.rendering.triangles import NO_MESHES, Meshes
 from phd_exp.rendering.worker import make
 
 MakeSpec = Callable[..., DatasetSpec]
@@ -147,6 +149,12 @@ def silhouettes(hits: Hits) -> Mask:
 def drawn(spec: DatasetSpec, n: int, meshes: Meshes, split: Split = "train") -> list[Scene]:
     """The first scenes of a mesh."""
     return [sample_object_scene(spec, split, index, meshes) for index in range(n)]
+
+
+def described(spec: DatasetSpec, split: Split, index: int, meshes: Meshes = NO_MESHES) -> SampleRecord:
+    """The record of a sample without its image."""
+    scene = sample_object_scene(spec, split, index, meshes) if spec.mesh else sample_scene(spec, split, index)
+    return describe(spec, split, index, scene, trace_pixels(scene, meshes), "0" * 64, meshes)
 
 
 def placed(scene: Scene, **changes: Any) -> SceneObject:
