@@ -21,6 +21,7 @@ from phd_exp.rendering.triangles import Meshes
 
 FILTER_WIDTH = 3.0  # px
 FINER = 3  # points along a side of a pixel at which the silhouettes of meshes are computed
+SIDES = (-1, -1, 1, 1)  # of a box that is a pixel larger
 REACH = 2  # px from a pixel to the farthest one that its filter touches
 POINTS = 13  # rays a pixel; with GENERATOR a Fibonacci lattice, whose points differ in both coordinates
 GENERATOR = 5
@@ -78,12 +79,11 @@ def filtered(fine: NDArray[np.floating[Any]], finer: int) -> Light:
 def coverage(scene: Scene, box: Box, meshes: Meshes) -> Light:
     """The share of each pixel of a box (height, width, 1), under the filter, that opaque objects cover."""
     finer = scene.model_copy(update={"S": FINER * scene.S, "f": FINER * scene.f})
-    left, top, right, bottom = (FINER * (edge + side) for edge, side in zip(box, (-1, -1, 1, 1), strict=True))
+    left, top, right, bottom = around = Box(*(FINER * (edge + side) for edge, side in zip(box, SIDES, strict=True)))
     covered: Light = np.zeros((bottom - top, right - left, 1))
     for number in range(len(scene.objects)):
-        shown, rows, columns = silhouette(finer, number, meshes, (range(top, bottom), range(left, right)))
-        place = slice(rows.start - top, rows.stop - top), slice(columns.start - left, columns.stop - left)
-        covered[place][shown] = 1.0
+        shown, part = silhouette(finer, number, meshes, around)
+        covered[part.top - top : part.bottom - top, part.left - left : part.right - left][shown] = 1.0
     return filtered(covered, FINER)
 
 

@@ -100,11 +100,11 @@ def _write_mask(
 ) -> dict[str, Any]:
     """Write the mask of an object; returns its boxes and pixels, of which those outside the image are not visible."""
     mask = rays.cylinder_mask(hits, number)
-    whole, rows, columns = rays.silhouette(record.as_scene, number, meshes)
+    whole, around = rays.silhouette(record.as_scene, number, meshes)
     name = f"{target}/mask_visib/{record.index:06d}_{number:06d}.png"
     written.write(name, file_of(Image.fromarray(np.uint8(255) * mask), "png"))
     return {
-        "bbox_obj": _box(whole, columns.start, rows.start),
+        "bbox_obj": _box(whole, around.left, around.top),
         "bbox_visib": _box(mask),
         "px_count_all": int(whole.sum()),
         "px_count_valid": int(np.isfinite(hits.depths[number]).sum()),

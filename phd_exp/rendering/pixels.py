@@ -26,6 +26,18 @@ class Box(NamedTuple):
         """Its rows and columns of an image."""
         return slice(self.top, self.bottom), slice(self.left, self.right)
 
+    @property
+    def middles(self) -> tuple[Light, Light]:
+        """Coordinates x and y (height, width) of the middles of its pixels."""
+        x, y = np.meshgrid(np.arange(self.left, self.right) + 0.5, np.arange(self.top, self.bottom) + 0.5)
+        return x, y
+
+    def within(self, other: "Box") -> "Box":
+        """Its part in another box, perhaps empty."""
+        left, top = max(self.left, other.left), max(self.top, other.top)
+        right, bottom = min(self.right, other.right), min(self.bottom, other.bottom)
+        return Box(left, top, max(left, right), max(top, bottom))
+
 
 # Level 9 of zlib saves 2 % of the bytes for twice the time. A JPEG has colour at full resolution, since a silhouette
 # is often a step in colour alone.

@@ -16,6 +16,7 @@ from phd_exp.optics.lens import Lens
 from phd_exp.optics.virtual import VirtualCamera, product
 from phd_exp.records.cameras import Calibration
 from phd_exp.records.scenes import Pose, Scene, SceneObject
+from phd_exp.rendering.pixels import Box
 from phd_exp.rendering.triangles import NO_MESHES, Meshes
 
 Image = NDArray[np.float64]
@@ -53,11 +54,9 @@ def trace_pixels(scene: Scene, meshes: Meshes = NO_MESHES) -> Hits:
             hits.depths[number] = meshes[item.shape].depths(*_placed(scene, item), scene.f, scene.S)
             hits.surfaces[number] = np.where(np.isfinite(hits.depths[number]), 1 + FACES * number, NOTHING)
             continue
-        rows, columns = (range(max(span.start, 0), min(span.stop, scene.S)) for span in window(scene, item))
-        if rows and columns:
-            x, y = pixel_middles(rows, columns)
-            place = (number, slice(rows.start, rows.stop), slice(columns.start, columns.stop))
-            hits.depths[place], hits.surfaces[place] = _cast(scene, number, x, y)
+        box = window(scene, item).within(Box(0, 0, scene.S, scene.S))
+        place = (number, *box.slices)
+        hits.depths[place], hits.surfaces[place] = _cast(scene, number, *box.middles)
     if scene.real_camera:
         outside = beyond_edges(scene)
         hits.depths[:, outside], hits.surfaces[:, outside] = np.inf, NOTHING
@@ -83,8 +82,8 @@ def trace_points(scene: Scene, x: Image, y: Image) -> Hits:
     """The hits (...) of the rays through points of the image: x to the right, y down, px."""
     hits = _no_hits(scene, x.shape)
     for number, item in enumerate(scene.objects):
-        rows, columns = window(scene, item)
-        near = (x >= columns.start) & (x <= columns.stop) & (y >= rows.start) & (y <= rows.stop)
+        left, top, right, bottom = window(scene, item)
+        near = (x >= left) & (x <= right) & (y >= top) & (y <= bottom)
         hits.depths[number, near], hits.surfaces[number, near] = _cast(scene, number, x[near], y[near])
     return hits
 
@@ -114,47 +113,29 @@ def truncation(scene: Scene, hits: Hits, meshes: Meshes = NO_MESHES) -> float:
     return float(1 - (hits.surfaces[0] != NOTHING).sum() / whole) if whole else 1.0
 
 
-Window = tuple[range, range]
-"""Rows and columns."""
-
-
 def silhouette(
-    scene: Scene, number: int = 0, meshes: Meshes = NO_MESHES, within: Window | None = None
-) -> tuple[Mask, range, range]:
-    """Pixels of an object in an image without borders or other objects, and the rows and columns of these pixels.
+    scene: Scene, number: int = 0, meshes: Meshes = NO_MESHES, within: Box | None = None
+) -> tuple[Mask, Box]:
+    """Pixels of an object in an image without borders or other objects, those of a box around it; and this box.
 
-    Pixels are those within a window, by default all.
+    It is clipped to a given box, by default not.
     """
     item = scene.objects[number]
     if item.shape in meshes:
         place = (*_placed(scene, item), scene.f, scene.S)
-        rows, columns = _clipped(meshes[item.shape].window(*place), within)
-        return np.isfinite(meshes[item.shape].depths(*place, window=(rows, columns))), rows, columns
-    rows, columns = _clipped(window(scene, item), within)
+        box = meshes[item.shape].window(*place)
+        box = box.within(within or box)
+        return np.isfinite(meshes[item.shape].depths(*place, box)), box
+    box = window(scene, item)
+    box = box.within(within or box)
     alone = scene.model_copy(update={"objects": scene.objects[number : number + 1]})
-    return trace_points(alone, *pixel_middles(rows, columns)).surfaces[0] != NOTHING, rows, columns
-
-
-def _clipped(whole: Window, within: Window | None) -> Window:
-    if within is None:
-        return whole
-    first, second = (
-        range(max(one.start, other.start), max(one.start, other.start, min(one.stop, other.stop)))
-        for one, other in zip(whole, within, strict=True)
-    )
-    return first, second
+    return trace_points(alone, *box.middles).surfaces[0] != NOTHING, box
 
 
 def _placed(scene: Scene, item: SceneObject) -> tuple[Image, Image]:
     """The map of an object's local frame to the camera's: a scaled rotation (3, 3), and a shift (3,), m."""
     turn = item.scale * product(rotation_matrix(scene.pose.rotation), rotation_matrix(item.rotation))
     return turn, in_camera_frame(np.array(item.position), scene.pose)
-
-
-def pixel_middles(rows: range, columns: range) -> tuple[Image, Image]:
-    """Coordinates x and y (rows, columns) of the middles of a rectangle of pixels."""
-    x, y = np.meshgrid(np.asarray(columns) + 0.5, np.asarray(rows) + 0.5)
-    return x, y
 
 
 def rotation_matrix(quaternion: tuple[float, float, float, float]) -> Image:
@@ -174,22 +155,23 @@ def in_camera_frame(position: Image, pose: Pose) -> Image:
     return product(rotation_matrix(pose.rotation), position) + np.array(pose.translation)
 
 
-def window(scene: Scene, item: SceneObject) -> tuple[range, range]:
-    """Rows and columns, possibly outside the image, that contain an object's silhouette: those of a ball around it.
+def window(scene: Scene, item: SceneObject) -> Box:
+    """A box, possibly outside the image, that contains an object's silhouette: that of a ball around it.
 
     The ball's projection on an axis of the image reaches from tan(angle - width) to tan(angle + width).
     """
     x, y, z = in_camera_frame(np.array(item.position), scene.pose)
     radius = 0.5 * item.scale * math.hypot(*item.dimensions)
     if z <= radius:  # next to or around the camera: only the image's borders bound the silhouette
-        return range(scene.S), range(scene.S)
-    return _shadow(y, z, radius, scene), _shadow(x, z, radius, scene)
+        return Box(0, 0, scene.S, scene.S)
+    (left, right), (top, bottom) = (_shadow(off_axis, z, radius, scene) for off_axis in (x, y))
+    return Box(left, top, right, bottom)
 
 
-def _shadow(off_axis: float, z: float, radius: float, scene: Scene) -> range:
+def _shadow(off_axis: float, z: float, radius: float, scene: Scene) -> tuple[int, int]:
     angle, width = math.atan2(off_axis, z), math.asin(radius / math.hypot(off_axis, z))
     first, last = (scene.f * math.tan(min(max(angle + side, -1.5), 1.5)) + scene.S / 2 for side in (-width, width))
-    return range(math.floor(first), math.ceil(last))
+    return math.floor(first), math.ceil(last)
 
 
 def _cast(scene: Scene, number: int, x: Image, y: Image) -> tuple[Image, Labels]:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phd_exp.optics.virtual import product
+from phd_exp.rendering.pixels import Box
 
 Depths = NDArray[np.float64]
 
@@ -47,26 +48,24 @@ class Triangles:
         middles = np.add.reduce(np.moveaxis(self.vertices[self.corners], 1, 0)) / 3
         return np.average(middles, axis=0, weights=self.areas + 1e-300)
 
-    def window(self, turn: Depths, shift: Depths, f: float, S: int) -> tuple[range, range]:
-        """Rows and columns of the bounding box of its silhouette, possibly outside the image (S, S)."""
+    def window(self, turn: Depths, shift: Depths, f: float, S: int) -> Box:
+        """The bounding box of its silhouette, possibly outside the image (S, S)."""
         x, y, _ = self._seen(turn, shift, f, S)
-        columns, rows = (range(math.floor(values.min()), math.ceil(values.max()) + 1) for values in (x, y))
-        return rows, columns
+        (left, right), (top, bottom) = ((math.floor(v.min()), math.ceil(v.max()) + 1) for v in (x, y))
+        return Box(left, top, right, bottom)
 
-    def depths(
-        self, turn: Depths, shift: Depths, f: float, S: int, window: tuple[range, range] | None = None
-    ) -> Depths:
+    def depths(self, turn: Depths, shift: Depths, f: float, S: int, box: Box | None = None) -> Depths:
         """Depth z of the surface in the middles of pixels, m; infinity where a ray misses it.
 
-        The pixels are those of the image (S, S), or of the rows and columns of a window. The mesh lies in front of
+        The pixels are those of the image (S, S), or of a box. The mesh lies in front of
         the camera, to whose frame `turn` (3, 3) and `shift` (3,) map the local one.
         """
         from phd_exp.rendering.rasterizing import lower_depths
 
-        rows, columns = window or (range(S), range(S))
+        left, top, right, bottom = box or Box(0, 0, S, S)
         x, y, z = self._seen(turn, shift, f, S)
-        result = np.full((len(rows), len(columns)), np.inf)
-        lower_depths(x - columns.start, y - rows.start, 1 / z, self.corners, result)
+        result = np.full((bottom - top, right - left), np.inf)
+        lower_depths(x - left, y - top, 1 / z, self.corners, result)
         return result
 
     def _seen(self, turn: Depths, shift: Depths, f: float, S: int) -> tuple[Depths, Depths, Depths]:

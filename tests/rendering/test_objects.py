@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
-from scipy import ndimage, stats
+from scipy import stats
 
 from phd_exp.records.scenes import Pose, Scene, Surroundings
 from phd_exp.records.spec import DatasetSpec
@@ -18,7 +18,7 @@ from phd_exp.rendering.objects import REACH, sample_object_scene, upright_rotati
 from phd_exp.rendering.pixels import Box
 from phd_exp.rendering.rays import cylinder_mask, rotation_matrix, trace_pixels, truncation, visibility
 from phd_exp.rendering.render import by_sky
-from phd_exp.rendering.samples import fast_settings, make_sample, photograph, shadow, unmixed
+from phd_exp.rendering.samples import fast_settings, make_sample, shadow, unmixed
 from phd_exp.rendering.sampling import about_axis, sample_scene
 from phd_exp.rendering.surroundings import photo_light, shaken
 from phd_exp.rendering.triangles import Triangles
@@ -292,23 +292,6 @@ def test_the_light_of_a_surface_does_not_depend_on_the_share_of_the_pixel_that_i
     assert (unmixed(0 * front, 0 * opacity) == 0).all()
     thin = np.where(np.arange(16)[:, None] == 8, 0.1, 0.0) * np.ones((12, 1, 1))
     np.testing.assert_allclose(unmixed(0.4 * np.repeat(thin, 3, axis=2), thin)[:, 7:10], 0.4)
-
-
-def test_outlines_are_no_brighter_than_surfaces(make_spec: MakeSpec, tmp_path: Path) -> None:
-    """A ball with needles, against many rays without a denoiser: no pixel is far above all of those around it."""
-    ball, rng = solid("sphere"), np.random.default_rng(2)
-    needles = ball.vertices * np.where(rng.random((len(ball.vertices), 1)) < 0.003, 1, 0.3)
-    file = write_mesh(tmp_path / "needles.ply", Triangles(needles, ball.corners))
-    spec = make_spec("object", mesh=str(file), sensor_size=96, f_range=(1100.0, 1100.0), xy_range=0.0)
-    images = []
-    for settings in (fast_settings(spec), Settings(128, denoised=False, points=None)):
-        renderer = Renderer(settings, spec)
-        renderer.is_opaque = settings.denoised  # the exact images have the tracer's own edges
-        scenes = (sample_object_scene(spec, "train", index, renderer.meshes) for index in range(2))
-        hits = ((scene, trace_pixels(scene, renderer.meshes)) for scene in scenes)
-        images.append([photograph(renderer, scene, seen, spec).astype(int) for scene, seen in hits])
-    above = [(ours - ndimage.maximum_filter(exact, (5, 5, 1))).max() for ours, exact in zip(*images, strict=True)]
-    assert max(above) < 60
 
 
 def test_the_ground_has_a_shadow_below_the_object(of_mesh: MakeSpec) -> None:

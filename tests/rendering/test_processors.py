@@ -27,7 +27,7 @@ def records(specs: list[str]) -> str:
     lines = []
     for spec in map(DatasetSpec.model_validate_json, specs):
         meshes = {"mesh": solid("cylinder")} if spec.mesh else NO_MESHES
-        for index in range(4):
+        for index in range(2):
             record = described(spec, "train", index, meshes)
             lines.append(f"{record.model_dump_json()} {mask(record, meshes).sum()} {clearing(record, meshes).sum()}")
     return "\n".join(lines)
