@@ -1,24 +1,16 @@
-"""Processes that work together: locks on files, child processes, and lines for the person who waits."""
+"""Processes that work together: locks on files, and lines for the person who waits."""
 
 import fcntl
 import os
 import platform
 import random
 import re
-import signal
-import subprocess
 import sys
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, nullcontext, suppress
-from multiprocessing import Pipe
-from multiprocessing.connection import Connection
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
 
 from phd_exp.records.errors import one_line
-
-PROJECT = Path(__file__).resolve().parents[2]
-PATIENCE = 10.0  # seconds that a child gets to finish its work before it is killed
 
 
 @contextmanager
@@ -51,70 +43,6 @@ def held(path: Path, *, waiting: str | None = None) -> Iterator[bool]:
                 announce(waiting)
                 fcntl.flock(stream, fcntl.LOCK_EX)
         yield free
-
-
-class Child:
-    """A process that runs `python -m MODULE`, connected to this one; a context at whose end the process has ended.
-
-    The module's main function begins with `parent()`. Unlike a `multiprocessing` child, the process imports nothing
-    of the caller's main module, so that it works from scripts, notebooks and tests alike. The connection closes when
-    its parent dies, however it dies.
-
-    Args:
-        module: the module to run.
-        environment: variables that are set in addition to this process's.
-        log: file to which the process's standard output and error are appended; by default they are those of this
-            process.
-    """
-
-    def __init__(self, module: str, environment: Mapping[str, str] | None = None, log: Path | None = None) -> None:
-        self.connection, theirs = Pipe()
-        importable = os.pathsep.join(filter(None, [str(PROJECT), os.environ.get("PYTHONPATH")]))
-        with theirs, nullcontext() if log is None else open(log, "ab") as stream:
-            self.process = subprocess.Popen(
-                [sys.executable, "-P", "-m", module, str(theirs.fileno())],
-                stdin=subprocess.DEVNULL,
-                stdout=stream,
-                stderr=stream,
-                pass_fds=[theirs.fileno()],
-                env={**os.environ, **(environment or {}), "PYTHONPATH": importable},
-            )
-
-    def __enter__(self) -> "Child":
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.connection.close()
-        self._end()
-
-    def send(self, message: Any) -> None:
-        """Send a message. If the process is dead, this does nothing: `receive` reports it."""
-        with suppress(BrokenPipeError):
-            self.connection.send(message)
-
-    def receive(self) -> Any:
-        """Wait for the next message. Raises it if it is an exception, and EOFError if the process ended instead."""
-        try:
-            message = self.connection.recv()
-        except (EOFError, ConnectionResetError):
-            raise EOFError(f"process {self.process.pid} {self._end()}") from None
-        if isinstance(message, Exception):
-            raise message
-        return message
-
-    def _end(self) -> str:
-        try:
-            code = self.process.wait(PATIENCE)
-        except subprocess.TimeoutExpired:
-            self.process.kill()
-            code = self.process.wait()
-        return f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with status {code}"
-
-
-def parent() -> Connection:
-    """In a `Child`, the connection to its parent. The child ignores Ctrl-C from here on; its parent handles it."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    return Connection(int(sys.argv[1]))
 
 
 @contextmanager

@@ -7,24 +7,30 @@ one of them seals. A kill loses the images in progress; the same command resumes
 """
 
 import math
+import os
+import sys
 import time
-from collections.abc import Generator, Sequence
-from contextlib import ExitStack, closing, suppress
+from collections.abc import Generator, Iterable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ProcessPoolExecutor, wait
+from contextlib import closing, contextmanager, suppress
 from itertools import islice
-from multiprocessing.connection import Connection, wait
+from multiprocessing import get_context
+from types import ModuleType
 
 from phd_exp.records.dataset import SPLITS, DatasetFolder
 from phd_exp.records.errors import RenderError, UserError, writing
-from phd_exp.records.processes import Child, announce, duration, usable_cores
+from phd_exp.records.processes import announce, duration, usable_cores
 from phd_exp.records.spec import DatasetSpec, Shard
 from phd_exp.rendering.blender import require_bpy
 from phd_exp.rendering.masks import ensure_drawn
 from phd_exp.rendering.objects import surroundings_of
 from phd_exp.rendering.progress import shown_progress
 from phd_exp.rendering.sealing import Sample, begin, seal, side_files, unmade
+from phd_exp.rendering.worker import begin_worker, make_here
 
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}  # of each worker
 TOGETHER = 128  # samples
+AHEAD = 2  # samples that wait or are in progress, for each process
 FEWEST_PER_WORKER = 8  # starting one more process costs about as much as rendering this many images
 FEWER = "preset=demo, or data.n_train=... data.n_test=..."
 
@@ -105,36 +111,52 @@ def _render(
 def render_all(
     folder: DatasetFolder, spec: DatasetSpec, samples: Sequence[Sample], workers: int, *, waits: bool = False
 ) -> Generator[tuple[Sample, bool], None, None]:
-    """Make samples and yield each with whether it is on disk, or another process makes it; `waits` until it has.
+    """Make samples in processes and yield each with whether it is on disk, or another process makes it.
 
-    Each worker makes one sample at a time. If the consumer stops early or a worker fails, no further sample begins,
-    the samples in progress are finished, and all processes end before the error is raised.
+    `waits`: until the other process has made it. If the consumer stops early or a process fails, no further sample
+    begins, the samples in progress are finished, and all processes end before the error is raised.
 
-    Raises RenderError if a worker failed or died.
+    Raises RenderError if a process failed or died.
     """
     log, todo = folder.cache / "render.log", iter(samples)
-    busy: dict[Connection, tuple[Child, Sample]] = {}
-    with ExitStack() as stack:
-        for sample in islice(todo, workers):
-            child = stack.enter_context(Child("phd_exp.rendering.worker", ONE_THREAD, log))
-            child.send((folder, spec))
-            child.send((*sample, waits))
-            busy[child.connection] = child, sample
+    workers = min(workers, len(samples)) or 1
+    pool = ProcessPoolExecutor(workers, get_context("spawn"), begin_worker, (log,))
+    busy: dict[Future[bool], Sample] = {}
+
+    def submit(several: Iterable[Sample]) -> None:
+        busy.update({pool.submit(make_here, folder, spec, sample, waits=waits): sample for sample in several})
+
+    try:
+        with _clean_start():
+            submit(islice(todo, AHEAD * workers))
         while busy:
-            for connection in wait(list(busy)):
-                assert isinstance(connection, Connection)
-                child, sample = busy.pop(connection)
-                try:
-                    is_there = child.receive()
-                except EOFError as death:
-                    raise RenderError(
-                        f"a render worker: {death}; finished images are kept, and the same command resumes "
-                        f"(its last words: {log})"
-                    ) from None
-                yield sample, is_there
-                if following := next(todo, None):
-                    child.send((*following, waits))
-                    busy[connection] = child, following
+            for future in wait(busy, return_when=FIRST_COMPLETED).done:
+                yield busy.pop(future), future.result()
+                submit(islice(todo, 1))
+    except BrokenExecutor:
+        raise RenderError(
+            "a render worker was killed, or memory ran out; finished images are kept, and the same command resumes "
+            f"(its last words: {log})"
+        ) from None
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+@contextmanager
+def _clean_start() -> Iterator[None]:
+    """Processes that begin here use one thread each, and import nothing of the caller's main module.
+
+    A script without `if __name__ == "__main__"` would otherwise run again in each of them.
+    """
+    main, before = sys.modules["__main__"], {name: os.environ.get(name) for name in ONE_THREAD}
+    sys.modules["__main__"] = ModuleType("__main__")
+    os.environ.update(ONE_THREAD)
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = main
+        for name, value in before.items():
+            os.environ.pop(name) if value is None else os.environ.update({name: value})
 
 
 def by_sky(spec: DatasetSpec, samples: Sequence[Sample]) -> Sequence[Sample]:

@@ -1,68 +1,81 @@
-"""`python -m phd_exp.rendering.worker FD`: a process that makes the samples that it receives."""
+"""What a process of the pool does: it makes samples that no other process makes."""
 
 import fcntl
+import os
+import signal
+import threading
 import traceback
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext, suppress
-from multiprocessing.connection import Connection
+from contextlib import contextmanager, nullcontext
+from multiprocessing import parent_process
+from pathlib import Path
 
 from phd_exp.records.dataset import DatasetFolder
 from phd_exp.records.errors import RenderError, UserError, writing
 from phd_exp.records.files import write_atomic
-from phd_exp.records.processes import one_core, parent
+from phd_exp.records.processes import one_core
 from phd_exp.records.scenes import SampleRecord, Split
 from phd_exp.records.spec import DatasetSpec
 from phd_exp.rendering.blender import Renderer
 from phd_exp.rendering.samples import fast_settings, make_sample
-from phd_exp.rendering.sealing import side_file
+from phd_exp.rendering.sealing import Sample, side_file
 
-Paint = Callable[[Split, int], tuple[bytes, SampleRecord]]
-
-
-def serve(connection: Connection) -> None:
-    """Receive a data set, then one sample after another; answer each as `make` does, or with a UserError.
-
-    Raises EOFError or BrokenPipeError when the parent is gone.
-    """
-    folder, spec = connection.recv()
-    renderer: Renderer | None = None  # built for the first sample, so that its errors are answers
-
-    def paint(split: Split, index: int) -> tuple[bytes, SampleRecord]:
-        nonlocal renderer
-        # Blender and its denoiser would start threads that take cores from the other workers
-        with one_core() if renderer is None else nullcontext():
-            renderer = renderer or Renderer(fast_settings(spec), spec)
-            return make_sample(renderer, spec, split, index)
-
-    while True:
-        split, index, waits = connection.recv()
-        answer: bool | UserError
-        try:
-            with writing(folder.root):
-                answer = make(folder, spec, split, index, paint, waits=waits)
-        except UserError as error:
-            answer = error
-        except Exception as error:
-            traceback.print_exc()
-            answer = RenderError(f"sample {index} of {split}: {type(error).__name__}: {error}")
-        connection.send(answer)
+Paint = Callable[[DatasetSpec, Split, int], tuple[bytes, SampleRecord]]
+_renderer: list[Renderer] = []  # that of this process, as soon as there is a first sample
 
 
-def make(folder: DatasetFolder, spec: DatasetSpec, split: Split, index: int, paint: Paint, *, waits: bool) -> bool:
+def begin_worker(log: Path) -> None:
+    """Prepare a process: its output goes to a file, its parent handles Ctrl-C, and it ends with its parent."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    with open(log, "ab") as stream:
+        for descriptor in (1, 2):
+            os.dup2(stream.fileno(), descriptor)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    parent = parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
+
+
+def make_here(folder: DatasetFolder, spec: DatasetSpec, sample: Sample, *, waits: bool) -> bool:
+    """`make` a sample by this process's renderer. Raises RenderError, whatever goes wrong."""
+    try:
+        with writing(folder.root):
+            return make(folder, spec, sample, _paint, waits=waits)
+    except UserError:
+        raise
+    except Exception as error:
+        traceback.print_exc()
+        raise RenderError(f"sample {sample[1]} of {sample[0]}: {type(error).__name__}: {error}") from None
+
+
+def _paint(spec: DatasetSpec, split: Split, index: int) -> tuple[bytes, SampleRecord]:
+    # Blender and its denoiser would start threads that take cores from the other processes
+    with nullcontext() if _renderer else one_core():
+        if not _renderer:
+            _renderer.append(Renderer(fast_settings(spec), spec))
+        return make_sample(_renderer[0], spec, split, index)
+
+
+def make(folder: DatasetFolder, spec: DatasetSpec, sample: Sample, paint: Paint, *, waits: bool) -> bool:
     """Write a sample's image and then its side file, unless they are there; returns whether they are.
 
     A sample that another process is making is not there, unless this one `waits` for it.
     """
-    with claimed(folder, split, index, waits=waits) as is_mine:
+    split, index = sample
+    with _claimed(folder, split, index, waits=waits) as is_mine:
         if is_mine and not _is_there(folder, spec, split, index):
-            image, record = paint(split, index)
+            image, record = paint(spec, split, index)
             write_atomic(folder.image_path(split, index, spec.image_format), image)
             write_atomic(side_file(folder, split, index), record.model_dump_json() + "\n")
         return is_mine
 
 
 @contextmanager
-def claimed(folder: DatasetFolder, split: Split, index: int, *, waits: bool) -> Iterator[bool]:
+def _claimed(folder: DatasetFolder, split: Split, index: int, *, waits: bool) -> Iterator[bool]:
     """Hold the right to make a sample: the lock on one byte of a file, which the system releases if the holder dies.
 
     Yields False if another process holds it, unless this one waits.
@@ -80,8 +93,3 @@ def _is_there(folder: DatasetFolder, spec: DatasetSpec, split: Split, index: int
     """Whether another process has made a sample, and perhaps sealed it, in the meantime."""
     image, side = folder.image_path(split, index, spec.image_format), side_file(folder, split, index)
     return image.exists() and (side.exists() or index < folder.manifest.count(split))
-
-
-if __name__ == "__main__":
-    with suppress(EOFError, BrokenPipeError, ConnectionResetError):
-        serve(parent())

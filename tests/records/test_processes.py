@@ -1,4 +1,4 @@
-"""Locks exclude other processes, and a child that dies is noticed."""
+"""Locks exclude other processes; lines of messages; processes on one core."""
 
 import os
 import threading
@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from phd_exp.records.processes import Child, announce, held, one_core
+from phd_exp.records.processes import announce, held, one_core
 
 
 def test_a_lock_is_held_once_and_awaited_in_silence_if_it_is_free(
@@ -29,32 +29,6 @@ def test_a_lock_that_is_a_link_is_refused(tmp_path: Path) -> None:
 def test_a_line_controls_no_terminal(capfd: pytest.CaptureFixture[str]) -> None:
     announce("a\x1b[2Jb\u202ec\x9bd\ne\u2066f\udcffg 中")
     assert capfd.readouterr().err == "a?[2Jb?c?d e?f?g 中\n"
-
-
-CHILD = """
-from phd_exp.records.processes import parent
-connection = parent()
-print("printed")
-while True:
-    connection.send(1 / connection.recv())
-"""
-
-
-def test_a_child_answers_until_it_dies_or_is_closed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "inverse.py").write_text(CHILD)
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    log = tmp_path / "log"
-    with Child("inverse", log=log) as dying, Child("inverse", log=log) as closed:
-        for child in (dying, closed):
-            child.send(4)
-            assert child.receive() == 0.25
-        dying.send(0)
-        with pytest.raises(EOFError, match=f"process {dying.process.pid} ended with status 1"):
-            dying.receive()
-        dying.send(4)  # does nothing
-    assert closed.process.returncode is not None
-    assert "ZeroDivisionError" in log.read_text()
-    assert log.read_text().count("printed") == 2
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="this system binds no process to cores")

@@ -1,6 +1,8 @@
 """A folder ends with the same bytes whatever the workers, the order, the shares and the interruptions."""
 
 import os
+import subprocess
+import sys
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
@@ -10,12 +12,11 @@ import pytest
 from phd_exp.records.dataset import SPLITS, DatasetFolder, sha256
 from phd_exp.records.errors import DatasetError, RenderError
 from phd_exp.records.files import read_jsonl
-from phd_exp.records.processes import Child
 from phd_exp.records.spec import DatasetSpec, Shard
 from phd_exp.rendering import blender, render, sealing
-from phd_exp.rendering.render import ONE_THREAD, ensure_rendered, render_all, worker_count
+from phd_exp.rendering.render import ensure_rendered, render_all, worker_count
 from phd_exp.rendering.sealing import Sample, begin, seal, side_file, side_files, unmade
-from tests.support.renders import N_TEST, N_TRAIN, contents, made, rendering_elsewhere, unsealed, wait_until
+from tests.support.renders import N_TEST, N_TRAIN, ROOT, contents, made, rendering_elsewhere, unsealed, wait_until
 
 ALL = (N_TRAIN, N_TEST)
 FIRST, SECOND = Shard(0, 2), Shard(1, 2)
@@ -44,7 +45,8 @@ def test_a_sample_is_the_same_alone_and_in_another_order(
     begun: DatasetFolder, small: DatasetFolder, small_spec: DatasetSpec
 ) -> None:
     order: list[Sample] = [("train", 7), ("test", 2), ("train", 3), ("train", 0)]
-    assert list(render_all(begun, small_spec, order, workers=1)) == [(sample, True) for sample in order]
+    made = list(render_all(begun, small_spec, order, workers=2))
+    assert sorted(made) == sorted((sample, True) for sample in order)
     for split, index in order:
         assert read_jsonl(side_file(begun, split, index)) == read_jsonl(small.metadata_path(split))[index : index + 1]
 
@@ -145,22 +147,19 @@ def test_a_lost_image_and_a_broken_record_are_rendered_again(
     assert contents(folder) == contents(small)
 
 
-@pytest.mark.slow
-@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="this system binds no process to cores")
-def test_a_worker_has_as_many_threads_on_many_cores_as_on_one(begun: DatasetFolder, small_spec: DatasetSpec) -> None:
-    cores, threads = os.sched_getaffinity(0), []
-    for number, some in enumerate((cores, {min(cores)})):
-        os.sched_setaffinity(0, some)  # a worker inherits it
-        try:
-            with Child("phd_exp.rendering.worker", ONE_THREAD) as worker:
-                worker.send((begun, small_spec))
-                for index in range(2):
-                    worker.send(("train", 2 * number + index, False))
-                    worker.receive()
-                threads.append(len(os.listdir(f"/proc/{worker.process.pid}/task")))
-        finally:
-            os.sched_setaffinity(0, cores)
-    assert threads[0] == threads[1]
+def test_a_script_without_a_guard_renders(folder: DatasetFolder, small_spec: DatasetSpec, tmp_path: Path) -> None:
+    """Processes of the pool do not run it again."""
+    script = tmp_path / "script.py"
+    script.write_text(
+        "from phd_exp.records.dataset import DatasetFolder\n"
+        "from phd_exp.records.spec import DatasetSpec\n"
+        "from phd_exp.rendering.render import ensure_rendered\n"
+        f"spec = DatasetSpec.model_validate_json({small_spec.model_dump_json()!r})\n"
+        f"print(ensure_rendered(DatasetFolder({str(folder.root)!r}), spec, 1, 0))\n"
+    )
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, env=environment, check=False)
+    assert (done.returncode, done.stdout) == (0, "True\n"), done.stderr
 
 
 def test_nothing_is_loaded_when_nothing_is_missing(

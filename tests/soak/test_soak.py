@@ -5,6 +5,7 @@ for a fifth of both. `pytest -s` shows the figures.
 """
 
 import json
+import multiprocessing
 import os
 import subprocess
 import sys
@@ -15,8 +16,8 @@ from pathlib import Path
 import pytest
 
 from phd_exp.records.dataset import DatasetFolder
-from phd_exp.records.processes import Child
 from phd_exp.records.spec import DatasetSpec
+from phd_exp.rendering.render import render_all
 from phd_exp.rendering.sealing import begin
 from tests.e2e.conftest import QUICK
 from tests.soak.soaker import memory
@@ -55,15 +56,12 @@ def test_a_render_worker_does_not_grow(tmp_path: Path, make_spec: Callable[..., 
     folder = DatasetFolder(tmp_path / "occl_scale")
     folder.cache.mkdir(parents=True)
     begin(folder, spec)
-    with Child("phd_exp.rendering.worker", log=tmp_path / "render.log") as worker:
-        worker.send((folder, spec))
-        kilobytes, handles = [], []
-        for index in range(IMAGES):
-            worker.send(("train", index, False))
-            worker.receive()
-            if index in (IMAGES // 10, IMAGES - 1):
-                kilobytes.append(memory(worker.process.pid))
-                handles.append(len(os.listdir(f"/proc/{worker.process.pid}/fd")))
+    samples, kilobytes, handles = [("train", index) for index in range(IMAGES)], [], []
+    for number, _ in enumerate(render_all(folder, spec, samples, workers=1)):
+        if number in (IMAGES // 10, IMAGES - 3):  # the last ones are finished at once
+            (worker,) = multiprocessing.active_children()
+            kilobytes.append(memory(worker.pid))
+            handles.append(len(os.listdir(f"/proc/{worker.pid}/fd")))
     print(f"\n{IMAGES} images: {kilobytes} kB, {handles} handles")
     assert kilobytes[1] < MOST_GROWTH * kilobytes[0]
     assert handles[1] == handles[0]

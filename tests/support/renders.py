@@ -92,7 +92,7 @@ def copying(source: DatasetFolder, seconds: float = 0.0) -> Callable[..., Iterat
     """`render_all` whose images are copies, each after a pause: for laws of what is rendered when."""
     records = {split: source.records(split) for split in SPLITS}
 
-    def paint(split: Split, index: int) -> tuple[bytes, SampleRecord]:
+    def paint(spec: DatasetSpec, split: Split, index: int) -> tuple[bytes, SampleRecord]:
         time.sleep(seconds)
         print("copied", split, index, file=sys.stderr)
         return source.image_path(split, index).read_bytes(), records[split][index]
@@ -100,8 +100,8 @@ def copying(source: DatasetFolder, seconds: float = 0.0) -> Callable[..., Iterat
     def render_all(
         folder: DatasetFolder, spec: DatasetSpec, samples: Sequence[tuple[Split, int]], workers: int, *, waits: bool
     ) -> Iterator[tuple[tuple[Split, int], bool]]:
-        for split, index in samples:
-            yield (split, index), make(folder, spec, split, index, paint, waits=waits)
+        for sample in samples:
+            yield sample, make(folder, spec, sample, paint, waits=waits)
 
     return render_all
 
