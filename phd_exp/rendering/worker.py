@@ -3,6 +3,7 @@
 import fcntl
 import os
 import signal
+import sys
 import threading
 import traceback
 from collections.abc import Callable, Iterator
@@ -27,6 +28,8 @@ _renderer: list[Renderer] = []  # that of this process, as soon as there is a fi
 def begin_worker(log: Path) -> None:
     """Prepare a process: its output goes to a file, its parent handles Ctrl-C, and it ends with its parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # Blender in the parent added folders that hold another package of its name
+    sys.path[:] = [folder for folder in sys.path if f"{os.sep}bpy{os.sep}" not in folder]
     with open(log, "ab") as stream:
         for descriptor in (1, 2):
             os.dup2(stream.fileno(), descriptor)

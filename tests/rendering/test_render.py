@@ -148,12 +148,14 @@ def test_a_lost_image_and_a_broken_record_are_rendered_again(
 
 
 def test_a_script_without_a_guard_renders(folder: DatasetFolder, small_spec: DatasetSpec, tmp_path: Path) -> None:
-    """Processes of the pool do not run it again."""
+    """Processes of the pool do not run it again, and find Blender although it is loaded here too."""
     script = tmp_path / "script.py"
     script.write_text(
         "from phd_exp.records.dataset import DatasetFolder\n"
         "from phd_exp.records.spec import DatasetSpec\n"
+        "from phd_exp.rendering.blender import load_bpy\n"
         "from phd_exp.rendering.render import ensure_rendered\n"
+        "load_bpy()\n"
         f"spec = DatasetSpec.model_validate_json({small_spec.model_dump_json()!r})\n"
         f"print(ensure_rendered(DatasetFolder({str(folder.root)!r}), spec, 1, 0))\n"
     )
