@@ -74,7 +74,7 @@ def test_they_grow_with_the_images(folder: DatasetFolder, small_spec: DatasetSpe
         ensure_rendered(folder, small_spec, n, 1)
         assert len(folder.drawn("masks.npy", n)) == n
     with pytest.raises(
-        DatasetError, match=r"masks\.npy: holds uint8 \(12, 28, 28\); expected uint8 \(13, 28, 28\); write"
+        DatasetError, match=r"masks\.npy: .*holds uint8 \(12, 28, 28\); expected uint8 \(13, 28, 28\)"
     ):
         folder.drawn("masks.npy", N_TRAIN + 1)
 
@@ -110,12 +110,12 @@ def test_one_of_another_version_is_refused_and_drawn_anew(
         earlier.setitem(masks.DRAW, "masks.npy", lambda *_: np.zeros((CELLS, CELLS), np.uint8))
         ensure_drawn(old, small_spec, N_TRAIN)
         assert not old.drawn("masks.npy", N_TRAIN).any()
-    with pytest.raises(DatasetError, match=r"masks\.npy: drawn by another version.*; write it by .* render data="):
+    with pytest.raises(DatasetError, match=r"masks\.npy: .*drawn by another version.*; write it by .* render data="):
         old.drawn("masks.npy", N_TRAIN)
     ensure_rendered(old, small_spec, N_TRAIN, N_TEST)
     assert old.drawn("masks.npy", N_TRAIN).any()
     (old.root / "masks.json").unlink()
-    with pytest.raises(DatasetError, match=r"masks\.npy: drawn by another version"):
+    with pytest.raises(DatasetError, match=r"masks\.npy: .*drawn by another version"):
         old.drawn("masks.npy", N_TRAIN)
 
 
