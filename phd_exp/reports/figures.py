@@ -98,13 +98,23 @@ def marks_on_image(
     return marks
 
 
+def marks_from_above(curves: LevelCurves, truth: np.ndarray | None) -> list[Mark]:
+    """The same of (x, z), metres: curves, mode and truth."""
+    blue = {"color": "#0072b2", "markersize": 6}
+    rings = zip(WIDTHS, curves.levels, curves.birds_eye, strict=False)
+    marks: list[Mark] = [
+        (points, "-", {**blue, "linewidth": width, "label": f"{100 * level:g} %"}) for width, level, points in rings
+    ]
+    marks.append((curves.mode[None, ::2], "x", {**blue, "label": "mode"}))
+    if truth is not None:
+        marks.append((truth[None, ::2], "o", {"color": "black", "markersize": 4, "label": "truth"}))
+    return marks
+
+
 def draw_birds_eye(axes: Axes, curves: LevelCurves, truth: np.ndarray | None) -> None:
     """Draw the curves of (x, z), the mode as a cross and the truth as a dot; the axes differ in scale."""
-    for width, level, points in zip(WIDTHS, curves.levels, curves.birds_eye, strict=False):
-        axes.plot(*points.T, color="#0072b2", linewidth=width, label=f"{100 * level:g} %")
-    axes.plot(curves.mode[0], curves.mode[2], "x", color="#0072b2", markersize=6, label="mode")
-    if truth is not None:
-        axes.plot(truth[0], truth[2], "o", color="black", markersize=4, label="truth")
+    for points, line, style in marks_from_above(curves, truth):
+        axes.plot(*points.T, line, **style)
     axes.set(xlabel="x (m)", ylabel="z (m)")
     axes.locator_params(axis="x", nbins=5)  # more labels would overlap
     axes.grid(alpha=0.25)

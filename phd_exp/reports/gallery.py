@@ -2,14 +2,15 @@
 
 import base64
 import io
-import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from matplotlib.ticker import MaxNLocator
 from PIL import Image
 
 from phd_exp.distributions.columns import from_columns, parameter_names
@@ -19,6 +20,7 @@ from phd_exp.evaluation.parquet import Arrays, require_columns
 from phd_exp.records.errors import UserError
 from phd_exp.records.files import require_plain
 from phd_exp.records.images import LARGEST_IMAGE, RENDERED, decoding, pillow_warnings
+from phd_exp.reports.figures import Mark, marks_from_above, marks_on_image
 from phd_exp.reports.quantities import SCORES
 
 EACH = 6
@@ -26,7 +28,7 @@ NEEDED = ("file_name", "f", "S", "x", "y", "z", "mode_x", "mode_y", "mode_z")
 LARGEST = 448  # pixels; larger test images are shrunk for the page
 _CLOSE = 0.25  # curves smaller than this share of the image have a close-up
 _SMALLEST = 0.1  # smallest side of a close-up, a share of the image
-_PANEL, _LEFT, _BOTTOM, _EDGE = 200.0, 44.0, 30.0, 6.0  # side and margins of the bird's-eye view, SVG units
+_LEFT, _TOP, _RIGHT, _BOTTOM = 44.0, 6.0, 194.0, 170.0  # of the bird's-eye view, SVG units; as in panels.html
 _FACTS = {
     "level": ("credible level of the truth", "", 2),
     "visibility": ("visibility", "", 2),
@@ -38,18 +40,14 @@ _FACTS = {
 
 
 @dataclass(frozen=True)
-class BirdsEye:
-    """The curves of (x, z) in a square of `_PANEL` units, with ticks in metres."""
+class Panel:
+    """What is drawn on an image, in its pixels, or from above, in SVG units with ticks in metres."""
 
     paths: list[str]
     mode: tuple[float, float]
     truth: tuple[float, float]
     x_ticks: list[tuple[float, str]]
     z_ticks: list[tuple[float, str]]
-    size: float = _PANEL
-    left: float = _LEFT
-    bottom: float = _PANEL - _BOTTOM
-    edge: float = _EDGE
 
 
 @dataclass(frozen=True)
@@ -58,7 +56,7 @@ class Picture:
 
     Attributes:
         image: as a `data:` address; None if the image is not available.
-        side: of the image, in pixels, the unit of `paths`, `mode` and `truth`.
+        side: of the image, in pixels.
         close_up: left, top and side of an enlarged part; None if the curves fill the image.
         facts: pairs of a name and a value.
     """
@@ -67,11 +65,9 @@ class Picture:
     alt: str
     image: str | None
     side: float
-    paths: list[str]
-    mode: tuple[float, float]
-    truth: tuple[float, float]
+    panel: Panel
     close_up: tuple[float, float, float] | None
-    birds_eye: BirdsEye | None
+    birds_eye: Panel | None
     facts: list[tuple[str, str]]
 
 
@@ -103,12 +99,20 @@ def make_gallery(table: Arrays, config: Mapping[str, str]) -> Gallery:
     order = np.argsort(error, kind="stable")  # NaN comes last, as the worst
     each = min(EACH, len(order) // 2) or 1
     source = images_folder(config)
+    chosen = {name: column[np.concatenate([order[:each], order[::-1][:each]])] for name, column in table.items()}
+    rows = [{name: column[place] for name, column in chosen.items()} for place in range(2 * each)]
+    pictures = [_picture(row, one, source) for row, one in zip(rows, _distributions(chosen, rows), strict=True)]
+    note = _why_no_images(source) if None in [picture.image for picture in pictures] else ""
+    return Gallery(ranked_by, pictures[:each], pictures[each:], note)
 
-    def pictures(rows: np.ndarray) -> list[Picture]:
-        return [_picture({name: table[name][row] for name in table}, source) for row in rows]
 
-    best, worst = pictures(order[:each]), pictures(order[::-1][:each])
-    return Gallery(ranked_by, best, worst, _why_no_images(source) if None in [p.image for p in best + worst] else "")
+def _distributions(table: Arrays, rows: Sequence[Mapping[str, Any]]) -> list[ProjectedHuber | None]:
+    """The distribution of each row: together if they are of one kind, else one by one."""
+    try:
+        every = from_columns({name: torch.from_numpy(table[name].astype(float)) for name in parameter_names(table)})
+    except (ValueError, KeyError):
+        return list(map(distribution_of, rows))
+    return [every[place] for place in range(len(rows))]
 
 
 def _why_no_images(source: Path | None) -> str:
@@ -120,12 +124,11 @@ def _why_no_images(source: Path | None) -> str:
     )
 
 
-def _picture(row: Mapping[str, Any], source: Path | None) -> Picture:
+def _picture(row: Mapping[str, Any], distribution: ProjectedHuber | None, source: Path | None) -> Picture:
     truth, mode = (np.array([row[prefix + axis] for axis in "xyz"]) for prefix in ("", "mode_"))
     f, S = float(row["f"]), float(row["S"])
-    curves = curves_of(row)
-    outlines = [on_image(points, f, S) for points in curves.projected] if curves else []
-    on = [on_image(at[:2] / at[2], f, S) for at in (truth, mode)]
+    curves = level_curves(distribution) if distribution else None
+    marks = marks_on_image(curves, mode, truth, partial(on_image, f=f, S=S))
     facts = _facts(row)
     image = load_image(source, str(row["file_name"])) if source else None
     return Picture(
@@ -133,10 +136,8 @@ def _picture(row: Mapping[str, Any], source: Path | None) -> Picture:
         alt=f"Test image {row['file_name']}: " + ", ".join(f"{name} {value}" for name, value in facts),
         image=_as_address(image) if image else None,
         side=S,
-        paths=[_svg_path(points) for points in outlines],
-        truth=_point(on[0]),
-        mode=_point(on[1]),
-        close_up=close_up(np.concatenate([*outlines, on[0][None], on[1][None]]), S),
+        panel=_panel(marks, lambda points: points),
+        close_up=close_up(np.concatenate([points for points, *_ in marks]), S),
         birds_eye=birds_eye_view(curves, truth) if curves and np.isfinite(truth).all() else None,
         facts=facts,
     )
@@ -200,35 +201,39 @@ def close_up(points: np.ndarray, S: float) -> tuple[float, float, float] | None:
     return round(float(left), 2), round(float(top), 2), round(side, 2)
 
 
-def birds_eye_view(curves: LevelCurves, truth: np.ndarray) -> BirdsEye:
+def birds_eye_view(curves: LevelCurves, truth: np.ndarray) -> Panel:
     """The view from above: x to the right, z upwards, scaled to the curves and the truth."""
-    seen = np.concatenate([*curves.birds_eye, curves.mode[None, ::2], truth[None, ::2]])
+    marks = marks_from_above(curves, truth)
+    seen = np.concatenate([points for points, *_ in marks])
     low, high = seen.min(axis=0), seen.max(axis=0)
     margin = np.maximum(0.06 * (high - low), 1e-9)
     low, high = low - margin, high + margin
-    width, height = _PANEL - _LEFT - _EDGE, _PANEL - _BOTTOM - _EDGE
 
     def place(points: np.ndarray) -> np.ndarray:
         share = (points - low) / (high - low)
-        return np.stack([_LEFT + width * share[..., 0], _PANEL - _BOTTOM - height * share[..., 1]], axis=-1)
+        return np.array([_LEFT, _BOTTOM]) + share * [_RIGHT - _LEFT, _TOP - _BOTTOM]
 
-    return BirdsEye(
-        paths=[_svg_path(place(points)) for points in curves.birds_eye],
-        mode=_point(place(curves.mode[::2])),
-        truth=_point(place(truth[::2])),
-        x_ticks=[(_point(place(np.array([x, low[1]])))[0], text) for x, text in _ticks(low[0], high[0])],
-        z_ticks=[(_point(place(np.array([low[0], z])))[1], text) for z, text in _ticks(low[1], high[1])],
+    ends = list(zip(low, high, strict=True))
+    ticks = ([v for v in MaxNLocator(4).tick_values(*end) if end[0] <= v <= end[1]] for end in ends)
+    x_ticks, z_ticks = (
+        [(float(place(np.full(2, v))[axis].round(2)), f"{v:.6g}".replace("-", "−")) for v in values]
+        for axis, values in enumerate(ticks)
     )
+    return _panel(marks, place, x_ticks, z_ticks)
 
 
-def _ticks(low: float, high: float) -> list[tuple[float, str]]:
-    """Two to five round numbers in an interval, with as many digits as distinguish them."""
-    least = (high - low) / 5
-    power = 10.0 ** math.floor(math.log10(least))
-    step = next((factor * power for factor in (1, 2, 5) if factor * power >= least), 10 * power)
-    digits = max(0, -math.floor(math.log10(step) + 1e-9))
-    values = [step * place for place in range(math.ceil(low / step), math.floor(high / step) + 1)]
-    return [(value, f"{value:.{digits}f}".replace("-", "−")) for value in values]
+def _panel(
+    marks: Sequence[Mark],
+    place: Callable[[np.ndarray], np.ndarray],
+    x_ticks: Sequence[tuple[float, str]] = (),
+    z_ticks: Sequence[tuple[float, str]] = (),
+) -> Panel:
+    """The marks of a figure as paths and points of SVG."""
+    placed = [(line, place(points)) for points, line, _ in marks]
+    mode, truth = (next(_point(points[0]) for line, points in placed if line == kind) for kind in "xo")
+    return Panel(
+        [_svg_path(points) for line, points in placed if line == "-"], mode, truth, list(x_ticks), list(z_ticks)
+    )
 
 
 def _svg_path(points: np.ndarray) -> str:

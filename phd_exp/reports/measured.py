@@ -4,7 +4,7 @@ import hashlib
 import json
 import os
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -29,7 +29,17 @@ from phd_exp.reports.table import file_stem
 
 Found = TypeVar("Found")
 
-VERSIONS = {"before": 4, "after": 6, "fusion": 1, "pairs": 1, "tracks": 4, "gallery": 1, "scene": 1, "shifts": 1}
+VERSIONS = {
+    "before": 4,
+    "after": 6,
+    "fusion": 1,
+    "pairs": 1,
+    "tracks": 4,
+    "gallery": 2,
+    "scene": 1,
+    "shifts": 1,
+    "ensembles": 1,
+}
 """Measurement -> its version. Raise it when the measurement gives other numbers: all runs are measured again."""
 
 
@@ -146,27 +156,28 @@ def kept_or_measured(
     folder: RunFolder, config: Mapping[str, str], measuring: Callable[[], Measured], kept: Path
 ) -> Measured:
     """The measurements stored in the folder `kept` if the run has not changed; else measures, and stores them."""
-    file = kept / f"{file_stem(*folder.names)}.json"
-    key = _key(folder, config)
+    files = [folder.predictions, folder.held_out, folder.views, folder.config_file, images_folder(config)]
+    files += [*sorted(folder.shifts.glob("*.parquet")), *sorted(folder.sequences.glob("*.parquet"))]
+    return stored(kept / f"{file_stem(*folder.names)}.json", files, _ADAPTER, measuring)
+
+
+def stored(
+    file: Path, sources: Sequence[Path | None], adapter: TypeAdapter[Found], measuring: Callable[[], Found]
+) -> Found:
+    """What a file holds if its sources and the versions have not changed; else measures, and writes it."""
+    key = hashlib.sha256(json.dumps([VERSIONS, *map(_stamp, sources)]).encode()).hexdigest()
     try:
         beginning(file)  # raises an error for a pipe, which would never be read
         content = json.loads(file.read_text())
         if content["key"] == key:
-            return _ADAPTER.validate_python(content["measured"])
+            return adapter.validate_python(content["measured"])
     except (OSError, ValueError, LookupError, TypeError):
         pass  # nothing is stored, or another version stored it
     measured = measuring()
     with suppress(OSError):  # then the next report measures again
         if beginning(file)[:8] in (b"", b'{"key": '):  # otherwise another program's
-            write_atomic(file, json.dumps({"key": key, "measured": _ADAPTER.dump_python(measured)}))
+            write_atomic(file, json.dumps({"key": key, "measured": adapter.dump_python(measured)}))
     return measured
-
-
-def _key(folder: RunFolder, config: Mapping[str, str]) -> str:
-    """A digest of all inputs of a measurement: the run's tables, its images, the versions."""
-    files = [folder.predictions, folder.held_out, folder.views, folder.config_file, images_folder(config)]
-    files += [*sorted(folder.shifts.glob("*.parquet")), *sorted(folder.sequences.glob("*.parquet"))]
-    return hashlib.sha256(json.dumps([VERSIONS, *map(_stamp, files)]).encode()).hexdigest()
 
 
 def _stamp(path: Path | None) -> tuple[str, int, int]:

@@ -33,13 +33,14 @@ from phd_exp.reports.table import printable
 class Report:
     """All runs and searches under a folder, sorted: read once for the terminal, the files and the pages.
 
-    `notes` are the problems of tables, figures and searches, which belong to no page.
+    `notes` are the problems of tables, figures and searches, which belong to no page; `kept` stores measurements.
     """
 
     folder: Path
     runs: tuple[Run, ...]
     searches: tuple[Search, ...] = ()
     notes: Notes = field(default_factory=Notes)
+    kept: Path | None = None
 
     @cached_property
     def numbers(self) -> pd.DataFrame:
@@ -91,7 +92,7 @@ class Report:
     @cached_property
     def ensembles(self) -> pd.DataFrame:
         """The scores of ensembles, as of `ensemble_scores`."""
-        return ensemble_scores(self.runs, self.notes)
+        return ensemble_scores(self.runs, self.notes, self.kept)
 
     @cached_property
     def means(self) -> pd.DataFrame:
@@ -119,7 +120,7 @@ def read_report(runs: Path, kept: Path | None = None, progress: Callable[[str], 
     searches = [
         one for one in read_searches(runs) if notes.attempt(partial(trials_of, one), _left_out(one)) is not None
     ]
-    return Report(runs, tuple(found), tuple(searches), notes)
+    return Report(runs, tuple(found), tuple(searches), notes, kept)
 
 
 def _left_out(search: Search) -> str:

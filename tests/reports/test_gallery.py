@@ -38,13 +38,13 @@ def test_a_baseline_is_ranked_by_distance_and_has_no_curves(tmp_path: Path) -> N
     assert gallery.note.startswith("gone/default/test: the renders of this run are missing")
     picture = gallery.worst[0]
     assert picture.name == table["file_name"][off.argmax()]
-    assert (picture.paths, picture.birds_eye, picture.image) == ([], None, None)
+    assert (picture.panel.paths, picture.birds_eye, picture.image) == ([], None, None)
 
 
 def test_marks_lie_where_the_camera_sees_them(table: Arrays) -> None:
     picture = make_gallery(table, {}).best[0]
     (place,) = np.flatnonzero(table["file_name"] == picture.name)
-    for mark, prefix in ((picture.truth, ""), (picture.mode, "mode_")):
+    for mark, prefix in ((picture.panel.truth, ""), (picture.panel.mode, "mode_")):
         u = np.array([table[f"{prefix}x"][place], table[f"{prefix}y"][place]]) / table[f"{prefix}z"][place]
         np.testing.assert_allclose(mark, on_image(u, float(table["f"][place]), 224.0), atol=0.01)
 
