@@ -2,6 +2,7 @@
 
 import base64
 import io
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -213,13 +214,18 @@ def birds_eye_view(curves: LevelCurves, truth: np.ndarray) -> Panel:
         share = (points - low) / (high - low)
         return np.array([_LEFT, _BOTTOM]) + share * [_RIGHT - _LEFT, _TOP - _BOTTOM]
 
-    ends = list(zip(low, high, strict=True))
-    ticks = ([v for v in MaxNLocator(4).tick_values(*end) if end[0] <= v <= end[1]] for end in ends)
     x_ticks, z_ticks = (
-        [(float(place(np.full(2, v))[axis].round(2)), f"{v:.6g}".replace("-", "−")) for v in values]
-        for axis, values in enumerate(ticks)
+        [(float(place(np.full(2, value))[axis].round(2)), text) for value, text in _ticks(low[axis], high[axis])]
+        for axis in (0, 1)
     )
     return _panel(marks, place, x_ticks, z_ticks)
+
+
+def _ticks(low: float, high: float) -> list[tuple[float, str]]:
+    """Two to five round numbers in an interval, with as many digits as distinguish them."""
+    values = MaxNLocator(5, steps=[1, 2, 5, 10]).tick_values(low, high)
+    digits = max(0, math.ceil(-math.log10(values[1] - values[0]) - 1e-9))
+    return [(value, f"{value:.{digits}f}".replace("-", "−")) for value in values if low <= value <= high]
 
 
 def _panel(
