@@ -2,12 +2,13 @@
 
 import io
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from itertools import groupby
 from pathlib import Path
 
 import pandas as pd
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from phd_exp.evaluation.point_errors import COLUMNS
 from phd_exp.records.errors import one_line
@@ -15,7 +16,7 @@ from phd_exp.records.written import Written
 from phd_exp.reports.kinds import chosen
 from phd_exp.reports.paper_tables import paper_tables
 from phd_exp.reports.report import Report
-from phd_exp.reports.table import Table, TableCell, TableRow
+from phd_exp.reports.table import Table, TableCell
 from phd_exp.reports.tables import other_tables
 
 SPECIAL = re.compile(r"([\\`*_\[\]<>#|~&@$])")
@@ -102,20 +103,22 @@ def markdown(table: Table) -> str:
         - 95 %
         <BLANKLINE>
     """
-    headings = [*table.stub, *table.columns]
-    aligned = ["---"] * len(table.stub) + ["---:"] * len(table.columns)
-    blank = "|" + " |" * len(headings)
-    body = f"\n{blank}\n".join("\n".join(map(_markdown_line, group)) for group in table.groups)
-    parts = [f"## {_plain(table.title)}", "\n".join([_joined(map(_plain, headings)), _joined(aligned), body])]
-    if table.gaps:
-        parts.append("\n".join(["Missing:", "", *(f"- {_plain(line)}" for line in table.gaps)]))
-    if table.command:
-        # a fence of more backticks than the command has in a row
-        fence = "`" * (1 + max((len(run) for run in re.findall("`+", table.command)), default=0))
-        space = "" if fence == "`" else " "
-        parts.append(f"Made by {fence}{space}{table.command}{space}{fence}")
-    parts.append("\n".join(f"- {_plain(note)}" for note in table.notes))
-    return "\n\n".join(parts) + "\n"
+    return _ENVIRONMENT.get_template("table.md").render(table=table, bold=_bold)
+
+
+def latex(table: Table) -> str:
+    """The table as an environment for \\input: caption, tabular, missing runs with their command, notes."""
+    notes = [*table.notes, *(["Missing:", *table.gaps] if table.gaps else [])]
+    # straight quotes, so that the command can be copied to a shell
+    command = _escaped(table.command).replace("'", r"\textquotesingle{}")
+    made = [f"Made by \\texttt{{{command}}}"] if command else []
+    return _ENVIRONMENT.get_template("table.tex").render(
+        table=table, notes=[*map(_escaped, notes), *made], bold=_bold
+    )
+
+
+def _bold(cell: TableCell, before: str, after: str, text: str) -> str:
+    return f"{before}{text}{after}" if cell.bold else text
 
 
 def _plain(text: str) -> str:
@@ -123,54 +126,11 @@ def _plain(text: str) -> str:
     return SPECIAL.sub(r"\\\1", one_line(text))
 
 
-def _markdown_line(row: TableRow) -> str:
-    return _joined([*map(_plain, row.stub), *map(_markdown_cell, row.cells)])
-
-
-def _markdown_cell(cell: TableCell) -> str:
-    ours = f"**{_plain(cell.ours)}**" if cell.bold else _plain(cell.ours)
-    first = f"{ours} {_plain(cell.spread)}".rstrip()
-    return f"{first}<br>{_plain(cell.below)}" if cell.below else first
-
-
-def _joined(texts: Iterable[str]) -> str:
-    return f"| {' | '.join(texts)} |"
-
-
-def latex(table: Table) -> str:
-    """The table as an environment for \\input: caption, tabular, missing runs with their command, notes."""
-    headings = " & ".join(map(_escaped, (*table.stub, *table.columns)))
-    label = re.sub(r"[^A-Za-z0-9-]", "-", table.stem)
-    notes = [_escaped(note) for note in table.notes]
-    if table.gaps:
-        notes += ["Missing:", *map(_escaped, table.gaps)]
-    if table.command:
-        # straight quotes, so that the command can be copied to a shell
-        command = _escaped(table.command).replace("'", r"\textquotesingle{}")
-        notes.append(f"Made by \\texttt{{{command}}}")
-    return "\n".join(
-        [
-            f"% {_escaped(table.title)}; needs \\usepackage{{booktabs}}",
-            r"\begin{table}",
-            r"\centering",
-            f"\\caption{{{_escaped(table.title)}}}",
-            f"\\label{{tab:{label}}}",
-            r"\footnotesize\setlength{\tabcolsep}{2.5pt}",
-            f"\\begin{{tabular}}{{@{{}}{'l' * len(table.stub)}{'r' * len(table.columns)}@{{}}}}",
-            r"\toprule",
-            f"{headings} \\\\",
-            r"\midrule",
-            "\n\\midrule\n".join(_latex_group(group, table.below) for group in table.groups),
-            r"\bottomrule",
-            r"\end{tabular}",
-            r"\par\medskip",
-            r"\begin{minipage}{\linewidth}\footnotesize\raggedright",
-            "\\par\n".join(notes),
-            r"\end{minipage}",
-            r"\end{table}",
-            "",
-        ]
-    )
+def _code(text: str) -> str:
+    """Code of Markdown, between more backticks than the text has in a row."""
+    fence = "`" * (1 + max(map(len, re.findall("`+", text)), default=0))
+    space = "" if fence == "`" else " "
+    return f"{fence}{space}{text}{space}{fence}"
 
 
 def _escaped(text: str) -> str:
@@ -178,20 +138,19 @@ def _escaped(text: str) -> str:
     return "".join(SYMBOLS.get(one) or (one if one.isascii() else f"U+{ord(one):04X}") for one in one_line(text))
 
 
-def _latex_group(rows: Sequence[TableRow], below: str) -> str:
-    """Two lines for a row whose cells have a second line; a label that repeats is printed once."""
-    lines = []
-    above = ""
-    for row in rows:
-        label, *rest = row.stub
-        lines.append([*map(_escaped, ["" if label == above else label, *rest]), *map(_latex_cell, row.cells)])
-        if any(cell.below for cell in row.cells):
-            second = [_escaped(cell.below) for cell in row.cells]
-            lines.append([*[""] * len(rest), f"\\quad {_escaped(below)}", *second])
-        above = label
-    return "\n".join(f"{' & '.join(line)} \\\\" for line in lines)
-
-
-def _latex_cell(cell: TableCell) -> str:
-    ours = f"\\textbf{{{_escaped(cell.ours)}}}" if cell.bold else _escaped(cell.ours)
-    return f"{ours} {_escaped(cell.spread)}".rstrip()
+_ENVIRONMENT = Environment(
+    loader=FileSystemLoader(Path(__file__).parent / "templates"),
+    autoescape=False,  # Markdown and LaTeX have their own filters
+    undefined=StrictUndefined,
+    trim_blocks=True,
+    lstrip_blocks=True,
+    keep_trailing_newline=True,
+    comment_start_string="<#",
+    comment_end_string="#>",
+)
+_ENVIRONMENT.filters |= {
+    "md": _plain,
+    "code": _code,
+    "tex": _escaped,
+    "label": lambda stem: re.sub(r"[^A-Za-z0-9-]", "-", stem),
+}
