@@ -32,7 +32,8 @@ def ensemble_scores(every: Sequence[Run], notes: Notes, kept: Path | None) -> pd
     folder `kept`, if given, stores the scores until a run changes.
     """
     rows = []
-    for key, alike in groupby(sorted(every, key=_configuration), key=_configuration):
+    densities = sorted((run for run in every if run.nll is not None), key=_configuration)
+    for key, alike in groupby(densities, key=_configuration):
         runs = list(alike)
         found = notes.attempt(partial(_stored, runs, kept), f"ensembles of {'/'.join(key)}: ") or {}
         rows += [
@@ -57,7 +58,6 @@ def _stored(runs: Sequence[Run], kept: Path | None) -> Scores:
 
 def _scores(runs: Sequence[Run]) -> Scores:
     """The scores; empty without an ensemble, and for densities of other shapes."""
-    runs = [run for run in runs if run.nll is not None]
     eight = {run.name.partition("-")[0]: run.folder.eight_views["test"] for run in runs}
     eight = {seed: file for seed, file in eight.items() if file.exists()}
     if len(runs) < 2 and not eight:
