@@ -108,7 +108,7 @@ def nees_columns(distribution: ProjectedHuber, xyz: Float[Tensor, "*draws sample
     With e the error of the mean: e . C^(-1) e = (z - E[z])^2/Var[z] + |q|^2/c, of expectation 3, and e_i^2/C_ii, of
     expectation 1. They are not chi-squared: their tails are longer.
 
-    Source: own derivation (e is linear in the independent t and q); checked in tests/distributions/test_nees.py.
+    Source: own derivation (e is linear in the independent t and q); checked in tests/distributions/test_columns.py.
     """
     squared = (xyz - distribution.mean).square()
     across = distribution.whiten(xyz).square().sum(-1) / HUBER_COVARIANCE

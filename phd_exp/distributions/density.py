@@ -89,9 +89,13 @@ class Density(ABC):
         return (weight * (self.depth_icdf(p) - self.depth_mean).square()).sum(0)
 
     def depth_crps(self, z: Float[Tensor, "*#batch"]) -> Float[Tensor, "*#batch"]:
-        """Continuous ranked probability score of a depth, metres: twice the mean pinball loss of all quantiles."""
+        """Continuous ranked probability score of a depth, metres: twice the mean pinball loss of all quantiles.
+
+        Source: Koenker and Bassett, "Regression quantiles" (1978), for the loss.
+        """
         p, weight = nodes(z)
-        return 2 * (weight * pinball(z - self.depth_icdf(p), p)).sum(0)
+        excess = z - self.depth_icdf(p)
+        return 2 * (weight * torch.maximum(p * excess, (p - 1) * excess)).sum(0)
 
     @property
     def mean(self) -> Float[Tensor, "*batch 3"]:
@@ -129,11 +133,3 @@ def quantile_between(
         is_low = cdf(middle) < p
         low, high = torch.where(is_low, middle, low), torch.where(is_low, high, middle)
     return high
-
-
-def pinball(excess: Float[Tensor, "..."], p: Float[Tensor, "..."]) -> Float[Tensor, "..."]:
-    """The pinball loss of a quantile of probability p that lies `excess` below the truth.
-
-    Source: Koenker and Bassett, "Regression quantiles" (1978).
-    """
-    return torch.maximum(p * excess, (p - 1) * excess)

@@ -31,20 +31,10 @@ def huber_energy(q: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch"]:
     return torch.where(outer, r - 0.5, squared / 2)
 
 
-def radial_cdf(r: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-    """P(|q| <= r) for r >= 0.
-
-    Source: own derivation; checked against quadrature in tests/distributions/test_huber.py.
-    """
-    inner = -torch.expm1(-r.square() / 2)
-    outer = RADIAL_NORMALISER - (1 + r) * torch.exp(0.5 - r)
-    return torch.where(r <= 1, inner, outer) / RADIAL_NORMALISER
-
-
 def energy_cdf(energy: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     """P(h(|q|) <= energy) for energies >= 0.
 
-    Source: own derivation (`radial_cdf` at the radius of this energy).
+    Source: own derivation; checked against quadrature in tests/distributions/test_huber.py.
     """
     inner = -torch.expm1(-energy)
     outer = RADIAL_NORMALISER - (energy + 1.5) * torch.exp(-energy)

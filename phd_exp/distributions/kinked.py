@@ -30,7 +30,7 @@ class Kinked(DepthLaw):
         log_a: log of the precision of z.
 
     Source: paper, section "Projected Huber distribution"; own derivations, checked against mpmath and quadrature in
-    tests/distributions/test_depth.py.
+    tests/distributions/test_depth_laws.py.
     """
 
     log_a: Numbers

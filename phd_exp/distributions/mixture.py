@@ -114,13 +114,12 @@ class Mixture:
         z, xy, slope, A_xy = _closest_projection(members)
         mu_z = first_mu_z[..., 0] * log_ratio.exp()
         A = A_xy * mu_z[..., None, None]
-        if members.k is None:
-            return ProjectedHuber(first + slope, mu_z, A, a, None, False, rounding)
         further = first_mu_z * torch.expm1(log_ratio)[..., None]
         on_first = first * first_mu_z + members.m_xy[..., 0, :] * further
         mu_xy = (on_first + xy + slope * (further - z)) / mu_z[..., None]
         apex = members.apex[..., 0, :2] + xy - slope * (first_mu_z + z)
-        return ProjectedHuber(mu_xy, mu_z, A, a, spd.matvec(A_xy, apex) / a[..., None], False, rounding)
+        k = None if members.k is None else spd.matvec(A_xy, apex) / a[..., None]
+        return ProjectedHuber(mu_xy, mu_z, A, a, k, False, rounding)
 
 
 def _closest_depth(members: ProjectedHuber) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
@@ -208,7 +207,7 @@ def _closest_projection(
     """A point (z, (x, y)) and the slope of the axis, in the coordinates of `_nodes`, and A_xy.
 
     They minimise the mean of h(|q|) - log|A_xy| over the mixture, with q = A_xy times the distance of (x, y) from the
-    axis at z. Unless the members' axes are free the axis passes through the camera, and the point is 0. h(|q|) is at
+    axis at z. Unless the members' axes are free the axis passes through the camera, which is the point. h(|q|) is at
     most |q|^2 / (2 max(1, |q_0|)) + constant, with equality at q_0: where that replaces it, the axis is a weighted
     regression and A_xy^(-2) a weighted covariance C, and each such step lowers the mean. The integral is a sum over
     `_nodes`.
@@ -218,7 +217,7 @@ def _closest_projection(
     for _ in range(_STEPS):
         z_0, xy_0 = ((pull * v).sum(-2, keepdim=True) / pull.sum(-2, keepdim=True) for v in (z, xy))
         if members.k is None:
-            z_0, xy_0 = torch.zeros_like(z_0), torch.zeros_like(xy_0)
+            z_0, xy_0 = -members.mu_z[..., :1, None], torch.zeros_like(xy_0)
         slope = (pull * (z - z_0) * (xy - xy_0)).sum(-2) / (pull * (z - z_0).square()).sum(-2)
         off = xy - xy_0 - slope[..., None, :] * (z - z_0)
         C = ((pull * off)[..., :, None] * off[..., None, :]).sum(-3)
@@ -237,22 +236,18 @@ def _nodes(
 ) -> tuple[Float[Tensor, "*batch nodes 1"], Float[Tensor, "*batch nodes 2"], Float[Tensor, "*batch nodes 1"]]:
     """Depths, (x, y) and weights of the `_whitened_nodes` at the `_depth_nodes` of all members.
 
-    (x, y) are relative to the axis of the first member. With a free axis, depths are relative to that of its mode.
-    This keeps the digits of narrow densities. The angles turn from each depth to the next.
+    (x, y) are relative to the axis of the first member, and depths to that of its mode, which keeps the digits of
+    narrow densities. The angles turn from each depth to the next.
     """
     nodes, weight = (torch.from_numpy(values).to(members.a) for values in _whitened_nodes())
     mu_z, mu_xy, m_xy = members.mu_z, members.mu_xy, members.m_xy
     turned = (m_xy - m_xy[..., :1, :])[..., None, :]
     z, share = _depth_nodes(members)
-    if members.k is None:
-        z = mu_z[..., None] + z
-        axis = z[..., None] * turned
-    else:
-        apart = mu_z - mu_z[..., :1]
-        at_mode = mu_z[..., None] * (mu_xy - mu_xy[..., :1, :])
-        at_mode = at_mode + apart[..., None] * members.apex[..., :1, :2] / mu_z[..., :1, None]
-        axis = at_mode[..., None, :] + z[..., None] * turned
-        z = apart[..., None] + z
+    apart = mu_z - mu_z[..., :1]
+    at_mode = mu_z[..., None] * (mu_xy - mu_xy[..., :1, :])
+    at_mode = at_mode + apart[..., None] * members.apex[..., :1, :2] / mu_z[..., :1, None]
+    axis = at_mode[..., None, :] + z[..., None] * turned
+    z = apart[..., None] + z
     spread = spd.inverse(members.A, members.log_det_A) * mu_z[..., None, None]
     xy = axis[..., None, :] + spd.matvec(spread[..., None, None, :, :], nodes)
     every = share[..., None] * weight / members.batch_shape[-1]

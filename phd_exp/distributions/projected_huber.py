@@ -4,15 +4,15 @@ With q = A_xy (x, y) - nu_xy z + k a (t - 1) and t = z / mu_z,
 
     -log p(v) = h(|q|) - log|A_xy| + log(2 pi (1 + e^(-1/2))) + a max(t, 1/t) + log(mu_z N(a))   for z > 0.
 
-q and t are independent, and v is affine in (q, t). Every statistic below follows from that. In the paper's density
-k = 0: its axis, the line q = 0, passes through the camera. A free axis passes through `apex` in the plane z = 0. The
-law of t may have a rounded mode in place of the kink at t = 1; then its energy and normaliser are those of `Rounded`.
+q and t are independent, and v is affine in (q, t): every statistic below follows from that. In the paper's density
+k = 0, and its axis, the line q = 0, passes through the camera; a free axis passes through `apex` in the plane z = 0.
+The law of t may have a rounded mode in place of the kink at t = 1; then energy and normaliser are those of `Rounded`.
 """
 
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import ClassVar, Literal, final
+from typing import Any, ClassVar, Literal, final
 
 import torch
 from jaxtyping import Float
@@ -77,8 +77,7 @@ class ProjectedHuber(Density, Distribution):
             if not 0 <= rounding < math.inf:
                 raise ValueError(f"rounding: got {rounding}; expected a finite number of at least 0")
         self._adopt(Natural.from_camera_frame(mu_xy, mu_z, A, a, k, rounding), validate_args)
-        if self._validate_args:
-            self._require_representable()
+        self._require_representable()
 
     @classmethod
     def about_axis(
@@ -90,9 +89,9 @@ class ProjectedHuber(Density, Distribution):
         a: Float[Tensor, "*#batch"],
         rounding: float = 0.0,
     ) -> "ProjectedHuber":
-        """The distribution whose axis has the slope m_xy and the (x, y) of `apex` at z = 0 (metres), not validated.
+        """The distribution whose axis has the slope m_xy and the (x, y) of `apex` at z = 0 (metres; None: 0).
 
-        Without an apex it is the paper's density, whose axis passes through the camera.
+        It is not validated.
         """
         if apex is None:
             return cls(m_xy, mu_z, A, a, None, False, rounding)
@@ -134,8 +133,7 @@ class ProjectedHuber(Density, Distribution):
         if _wants_validation(validate_args):
             require(raw=raw, f=f, S=S, mu_z0=mu_z0)
         distribution = cls._of(Natural.from_raw(raw, f, S, mu_z0), validate_args)
-        if distribution._validate_args:
-            distribution._require_representable()
+        distribution._require_representable()
         return distribution
 
     @classmethod
@@ -152,7 +150,9 @@ class ProjectedHuber(Density, Distribution):
         self._validate_args = _wants_validation(validate_args)
 
     def _require_representable(self) -> None:
-        """Raise ValueError if mode or covariances overflow in the data type."""
+        """Raise ValueError if mode or covariances overflow in the data type, unless validation is off."""
+        if not self._validate_args:
+            return
         covariances = (self.covariance_matrix.flatten(-2), self.projected_covariance.flatten(-2))
         overflow = ~torch.cat([self.mode, self.mean, *covariances], dim=-1).isfinite().all(-1)
         if bool(overflow.any()):
@@ -187,12 +187,6 @@ class ProjectedHuber(Density, Distribution):
         return f"ProjectedHuber(batch_shape={tuple(self.batch_shape)})"
 
     @property
-    def parameters(self) -> dict[str, Tensor]:
-        """The tensors that the constructor takes; with a free axis also k."""
-        found = {"mu_xy": self.mu_xy, "mu_z": self.mu_z, "A": self.A, "a": self.a}
-        return found if self.k is None else found | {"k": self.k}
-
-    @property
     def mu_xy(self) -> Float[Tensor, "*batch 2"]:
         """Centre of (x, y)/z, that of the mode."""
         return spd.matvec(self._A_xy_inverse, self._natural.nu_xy)
@@ -204,10 +198,7 @@ class ProjectedHuber(Density, Distribution):
 
     @property
     def apex(self) -> Float[Tensor, "*batch 3"]:
-        """Where the axis meets the plane z = 0, metres; the camera without a free axis.
-
-        The density of v is that of the paper at v - apex.
-        """
+        """Where the axis meets the plane z = 0, metres: the density of v is that of the paper at v - apex."""
         if self.k is None:
             return self._natural.log_mu_z.new_zeros(()).expand((*self.batch_shape, 3))
         return pad(spd.matvec(self._A_xy_inverse, self.k * self.a[..., None]), (0, 1))
@@ -267,8 +258,7 @@ class ProjectedHuber(Density, Distribution):
     def log_prob(self, value: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*#batch"]:
         """Log density of a position (metres), nats per cubic metre; -inf, with zero gradient, for z <= 0.
 
-        It is -inf at infinity too. The transforms of `torch.func` work, except for forward mode within forward mode:
-        jacfwd of jacfwd raises NotImplementedError; use hessian.
+        It is -inf at infinity too. `torch.func` works; jacfwd of jacfwd raises NotImplementedError: use hessian.
 
         Raises:
             ValueError: the shape does not fit the batch shape, or a coordinate is NaN (if arguments are validated).
@@ -336,16 +326,11 @@ class ProjectedHuber(Density, Distribution):
     def projected_mean(self) -> Float[Tensor, "*batch 2"]:
         """Mean of (x, y)/z, m_xy + E[1/z] (x, y) of the apex: mu_xy without a free axis.
 
-        Source: own derivation; checked against quadrature in tests/distributions/test_free_axis.py.
+        Source: own derivation; checked against quadrature in tests/distributions/test_projected_huber.py.
         """
         if self.k is None:
             return self.mu_xy
-        return self.mu_xy + self._drift * self.depth_law.inverse_moments[0][..., None]
-
-    @property
-    def _drift(self) -> Float[Tensor, "*batch 2"]:
-        """m_xy - mu_xy of a free axis, without their difference."""
-        return -self.apex[..., :2] / self.mu_z[..., None]
+        return self.mu_xy - self.apex[..., :2] * (self.depth_law.inverse_moments[0] / self.mu_z)[..., None]
 
     @property
     def projected_covariance(self) -> Float[Tensor, "*batch 2 2"]:
@@ -356,7 +341,7 @@ class ProjectedHuber(Density, Distribution):
         across = huber.HUBER_COVARIANCE * spd.square(spd.inverse(self.A, self.log_det_A))
         if self.k is None:
             return across
-        d = self._drift * self.depth_law.inverse_moments[1].sqrt()[..., None]
+        d = self.apex[..., :2] * (self.depth_law.inverse_moments[1].sqrt() / self.mu_z)[..., None]
         return across + d[..., :, None] * d[..., None, :]
 
     @property
@@ -395,10 +380,9 @@ class ProjectedHuber(Density, Distribution):
         Source: own derivation (q and t are independent); gradients by the implicit function theorem.
         """
         shape = self._extended_shape(torch.Size(sample_shape))[:-1]
-        dtype, device = self._natural.log_a.dtype, self._natural.log_a.device
-        q = huber.sample_whitened(shape, dtype=dtype, device=device, generator=generator)
-        p = torch.rand(shape, dtype=dtype, device=device, generator=generator)
-        z = self.depth_icdf(p.clamp_min(torch.finfo(dtype).eps / 2))  # rand may return 0, where z would be 0
+        kind: Any = {"dtype": self._natural.log_a.dtype, "device": self._natural.log_a.device, "generator": generator}
+        q, p = huber.sample_whitened(shape, **kind), torch.rand(shape, **kind)
+        z = self.depth_icdf(p.clamp_min(torch.finfo(p.dtype).eps / 2))  # rand may return 0, where z would be 0
         across = q + self._natural.nu_xy * z[..., None]
         xy = spd.matvec(self._A_xy_inverse, across if self.k is None else across - self._natural.turn(z))
         return torch.cat([xy, z[..., None]], dim=-1)

@@ -11,7 +11,7 @@ the mode and |s| - r far from it. Up to a constant, the energy is the least w >=
 Integrals over t become integrals over x with a sinh l = min(a, r) sinh x, where the integrands are smooth for every
 a. They end where the energy is 50, and are computed by Gauss's rule.
 
-Source: own derivation; checked against mpmath in tests/distributions/test_rounded.py.
+Source: own derivation; checked against mpmath in tests/distributions/test_depth_laws.py.
 """
 
 import math
@@ -33,7 +33,6 @@ _SHARE = 0.95  # of the largest exponent, up to which e^l is computed
 _LARGEST_ENERGY = 50.0
 _NODES, _PART, _LEVEL = 64, 40, 40  # nodes for the whole law, one of its tails, and each part of a level
 _NEWTON_STEPS, _CLOSEST_STEPS = 3, 20
-_LEAST_BEND = 0.1  # of J in log a, which is about 1 at the minimum where the law is known
 Points = Float[Tensor, "*#batch points"]
 
 
@@ -165,6 +164,17 @@ class Rounded(DepthLaw):
         squared = y.square()
         return self._rise(y) + squared / (self.r + (self.r**2 + squared).sqrt())
 
+    def _slope(self, y: Tensor) -> Tensor:
+        """Its derivative by log a."""
+        squared = y.square()
+        return self._rise(y) + squared / (self.r**2 + squared).sqrt()
+
+    def _curvature(self, y: Tensor) -> Tensor:
+        """Its second derivative by log a."""
+        squared = y.square()
+        R_squared = self.r**2 + squared
+        return self._rise(y) + squared / R_squared.sqrt() * (2 - squared / R_squared)
+
     def _at(self, x: Points) -> "_Points":
         # by exp and log, because runtimes of exported graphs have hyperbolic functions in float32 alone
         grown, shrunk = x.exp(), (-x).exp()
@@ -231,21 +241,28 @@ class Rounded(DepthLaw):
     def closest_to(self, log_t: Points, share: Points) -> tuple[Numbers, Numbers]:
         """The log mu_z and log a of the law with the highest mean log density over depths of these shares.
 
-        By Newton's method from log mu_z = 0 and log a on J = E[energy] + log mu_z + `log_normaliser`, whose energy is
-        convex in log mu_z. Steps are limited, and the curvature is bounded from below.
+        By Newton's method from log mu_z = 0 and log a; the energy is convex in log mu_z. The derivatives are those of
+        J = E[energy] + log mu_z + `log_normaliser`, with l the log of depth over mu_z, s = a sinh l, c = a cosh l and
+        R = sqrt(s^2 + r^2).
         """
-        place, log_a = torch.zeros_like(self.log_a), self.log_a.detach()
+        place, log_a = torch.zeros_like(self.log_a), self.log_a
         for _ in range(_CLOSEST_STEPS):
-            with torch.enable_grad():
-                x = torch.stack([place, log_a]).requires_grad_()
-                energy = Rounded(x[1, ..., None], self.r).energy(log_t - x[0, ..., None])
-                J = (share * energy).sum(-1) + x[0] + Rounded(x[1], self.r).log_normaliser
-                (by,) = torch.autograd.grad(J.sum(), x, create_graph=True)
-                bend, both = torch.autograd.grad(by[0].sum(), x, retain_graph=True)[0]
-                bend_a = torch.autograd.grad(by[1].sum(), x)[0][1].clamp_min(_LEAST_BEND)
+            law = Rounded(log_a, self.r)
+            own = law._whole[0].y
+            l = log_t - place[..., None]
+            far, near = law._a * l.exp() / 2, law._a * (-l).exp() / 2
+            s, c = far - near, far + near
+            R = (s.square() + self.r**2).sqrt()
+            by_place = 1 - (share * (s + s * c / R)).sum(-1)
+            mean_slope, varied = law._moments(law._slope(own))
+            by_a = (share * law._slope(s)).sum(-1) - mean_slope
+            bend = (share * (c + (c.square() * self.r**2 / R.square() + s.square()) / R)).sum(-1)
+            both = -(share * (s + s * c / R * (2 - (s / R).square()))).sum(-1)
+            bend_a = varied + (share * law._curvature(s)).sum(-1) - law._moments(law._curvature(own))[0]
+            bend_a = bend_a.maximum(varied / 2)
             determinant = (bend * bend_a - both.square()).clamp_min(bend * bend_a / 2)
-            place = place - ((bend_a * by[0] - both * by[1]).detach() / determinant).clamp(-0.5, 0.5)
-            log_a = log_a - ((bend * by[1] - both * by[0]).detach() / determinant).clamp(-0.5, 0.5)
+            place = place - ((bend_a * by_place - both * by_a) / determinant).clamp(-0.5, 0.5)
+            log_a = log_a - ((bend * by_a - both * by_place) / determinant).clamp(-0.5, 0.5)
         return place, log_a
 
 

@@ -12,10 +12,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from phd_exp.distributions import Density, PointEstimate, ProjectedHuber
-from phd_exp.distributions.closest import closest_to_student
 from phd_exp.distributions.gaussian_mixture import GaussianMixture
 from phd_exp.distributions.natural import precision
-from phd_exp.distributions.shaped import Shaped, StudentT
+from phd_exp.distributions.shaped import Shaped, StudentT, closest_to_student
 from phd_exp.geometry.camera import Camera
 from phd_exp.geometry.charts import Chart, DepthScale
 

@@ -9,6 +9,7 @@ from scipy import integrate
 
 from phd_exp.distributions import ProjectedHuber
 from phd_exp.distributions.along import marginal, quantiles_along
+from tests.support.densities import parameters
 
 P = np.array([0.005, 0.05, 0.25, 0.5, 0.75, 0.95, 0.995])
 SIDEWAYS = np.array([0.3, -0.4, math.sqrt(0.75)])
@@ -60,7 +61,7 @@ def test_the_marginal_is_an_integral_of_the_density() -> None:
 
 def test_a_batch_has_the_quantiles_of_its_distributions() -> None:
     several = [distribution(a, A, k) for (a, A), k in zip(PRECISIONS, [(0, 0), (5, -9), (0, 0), (1, 1)], strict=True)]
-    columns = zip(*(one.parameters.values() for one in several), strict=True)
+    columns = zip(*(parameters(one).values() for one in several), strict=True)
     directions = np.array([SIDEWAYS, [0.0, 0.0, 1.0], [1e-3, 0.0, 1.0], -SIDEWAYS * [1, 1, -1]])
     together = quantiles_along(ProjectedHuber(*map(torch.stack, columns)), directions, P)
     alone = np.stack([along(one, direction) for one, direction in zip(several, directions, strict=True)])

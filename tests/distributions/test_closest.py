@@ -6,8 +6,7 @@ import pytest
 import torch
 
 from phd_exp.distributions import ProjectedHuber
-from phd_exp.distributions.closest import closest_to_student
-from phd_exp.distributions.shaped import StudentT
+from phd_exp.distributions.shaped import StudentT, closest_to_student
 
 RAW = torch.tensor([0.3, -0.1, 30, 5, 60, 5e4, 0.5], dtype=torch.float64)
 AXIS = [0.8, -0.4]  # of a density so narrow in depth that near and far have equal laws

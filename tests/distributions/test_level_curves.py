@@ -9,9 +9,7 @@ from matplotlib.path import Path as Outline
 from scipy import integrate
 
 from phd_exp.distributions import ProjectedHuber
-from phd_exp.distributions.level_curves import LEVELS, level_curves, on_image
-from phd_exp.geometry.camera import Camera
-from phd_exp.geometry.charts import DepthScale, Projected
+from phd_exp.distributions.level_curves import LEVELS, level_curves
 
 SAMPLES = 50_000
 
@@ -71,15 +69,6 @@ def test_the_law_of_the_birds_eye_view_is_constant_along_a_curve(distribution: P
         xyz = torch.stack([x, y, z], dim=-1)
         density = integrate.simpson(distribution.log_prob(xyz).exp().numpy(), x=y.numpy())
         np.testing.assert_allclose(density, density[0], rtol=1e-2)
-
-
-def test_pixels_are_the_cameras() -> None:
-    camera = Camera(torch.tensor([1500.0], dtype=torch.float64), 224.0)
-    xyz = torch.tensor([[0.11, -0.07, 3.7]], dtype=torch.float64)
-    depth = DepthScale.from_ranges(f_range=(1200.0, 2000.0), z_range=(3.0, 5.0))
-    v_p = Projected(depth).coordinates(xyz, camera)[:, :2].numpy()
-    u = (xyz[:, :2] / xyz[:, 2:]).numpy()
-    np.testing.assert_allclose(on_image(u, 1500.0, 224.0), 112 * (1 + v_p), rtol=1e-12)
 
 
 def test_one_distribution_and_levels_between_none_and_all() -> None:

@@ -79,24 +79,11 @@ def test_every_sample_is_in_exactly_one(name: str, edges: int | tuple[float, ...
 
 
 def test_labels_say_name_edges_and_unit() -> None:
-    depth = torch.linspace(3, 5, 401)
-    assert list(strata("depth", depth, 4, "m")) == [
-        "depth 3.0-3.5 m",
-        "depth 3.5-4.0 m",
-        "depth 4.0-4.5 m",
-        "depth 4.5-5.0 m",
-    ]
-    visibility = torch.tensor([0.1, 0.25, 0.5, 1.0, math.nan])
-    assert list(strata("visibility", visibility, (0.0, 0.25, 0.5, 0.9))) == [
-        "visibility 0-0.25",
-        "visibility 0.25-0.5",
-        "visibility 0.5-0.9",
-        "visibility above 0.9",
-        "visibility unknown",
-    ]
-
-
-def test_parts_are_of_equal_size_and_include_their_lower_edge() -> None:
+    depth, visibility = torch.linspace(3, 5, 401), torch.tensor([0.1, 0.25, 0.5, 1.0, math.nan])
+    parts = ("3.0-3.5", "3.5-4.0", "4.0-4.5", "4.5-5.0")
+    assert list(strata("depth", depth, 4, "m")) == [f"depth {part} m" for part in parts]
+    parts = ("0-0.25", "0.25-0.5", "0.5-0.9", "above 0.9", "unknown")
+    assert list(strata("visibility", visibility, (0.0, 0.25, 0.5, 0.9))) == [f"visibility {part}" for part in parts]
     assert [int(mask.sum()) for mask in strata("x", VALUES["spread"], 4).values()] == [125, 125, 125, 125]
     masks = [mask.int().tolist() for mask in strata("x", VALUES["on the edges"], (0.0, 0.25, 0.5, 1.0)).values()]
     assert masks == [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 1]]

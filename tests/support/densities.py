@@ -44,6 +44,12 @@ def from_raw(raw: Sequence[float] | Tensor, f: float = F) -> ProjectedHuber:
     return ProjectedHuber.from_raw(torch.as_tensor(raw, dtype=torch.float64), f=f, S=S, mu_z0=MU_Z0)
 
 
+def parameters(p: ProjectedHuber) -> dict[str, Tensor]:
+    """The tensors that the constructor takes; with a free axis also k."""
+    found = {"mu_xy": p.mu_xy, "mu_z": p.mu_z, "A": p.A, "a": p.a}
+    return found if p.k is None else found | {"k": p.k}
+
+
 TRAINED = (20.0, -45.0, 90.0, 15.0, 120.0, 60.0, 4.0)
 FREE = {
     "free axis": from_camera_frame((0.05, -0.03), 4.2, (120.0, 250.0), 0.6, 25.0, (1.4, -0.6)),

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from phd_exp.distributions import ProjectedHuber
 from phd_exp.fusion import Pose
+from tests.support.densities import parameters
 
 
 def rotations(n: int, generator: torch.Generator) -> Tensor:
@@ -55,4 +56,4 @@ def random_problems(
 
 def columns_of(predictions: ProjectedHuber) -> tuple[Tensor, ...]:
     """The arguments of the constructor."""
-    return tuple(predictions.parameters.values())
+    return tuple(parameters(predictions).values())
