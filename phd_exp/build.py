@@ -1,22 +1,26 @@
 """From a checked configuration to its parts: the network and the source of samples, without Lightning."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
+import torch
 from torch import nn
+from torch.overrides import TorchFunctionMode
 
 from phd_exp.config import FolderConfig, RenderedConfig, RunConfig
 from phd_exp.config.sections import DataConfig
-from phd_exp.config.targets import build, custom_parts
+from phd_exp.config.targets import OTHER_VERSION, build, custom_parts, is_ours
 from phd_exp.data.folder import FolderSource
 from phd_exp.data.images import SHRINKING
 from phd_exp.data.sources import Part, RenderedSource, Source
 from phd_exp.geometry.charts import DepthScale
 from phd_exp.models.backbones import Backbone, pooled
 from phd_exp.models.regressor import FocalLengthInput, Regressor
+from phd_exp.models.trained import TrainedNetwork
+from phd_exp.models.weights import fill, regressor_weights
 from phd_exp.records.dataset import DatasetFolder
-from phd_exp.records.errors import ConfigError, RunError, gist, in_user_code, install
+from phd_exp.records.errors import ConfigError, RunError, UserError, gist, in_user_code, install
 from phd_exp.records.own_images import DetectionFolder
 from phd_exp.records.runs import RunFolder
 
@@ -65,6 +69,60 @@ def _without_weights(node: Any) -> Any:
     if not isinstance(node, dict):
         return node
     return {key: _without_weights(value) for key, value in node.items() if key not in ("pretrained", "weights")}
+
+
+def trained_network(
+    folders: Sequence[RunFolder], configs: Sequence[RunConfig], views: int = 1, device: str = "auto"
+) -> TrainedNetwork:
+    """The networks of runs with the weights of their best checkpoints, or their last, as one ensemble.
+
+    Raises RunError for a run without usable weights or constants, ConfigError for a configuration that describes no
+    network, or one that joins no ensemble.
+    """
+    constant_f = recorded_constants(folders[0])[1] if configs[0].camera.focal_length == "constant" else None
+    networks = [_trained(folder, config) for folder, config in zip(folders, configs, strict=True)]
+    place = ("cuda" if torch.cuda.is_available() else "cpu") if device == "auto" else device
+    try:
+        return TrainedNetwork(networks, configs[0].data.image_size, constant_f, views).to(place)
+    except ValueError as error:
+        raise ConfigError(f"{folders[0].path}: {error}") from None
+
+
+def _trained(folder: RunFolder, config: RunConfig) -> Regressor:
+    """The network of one run, of whose checkpoint only tensors are read.
+
+    It is first built without memory, and must fit: a stored configuration may describe a network of any size.
+    """
+    require_same_shrinking(folder, config.data)
+    depth, _ = recorded_constants(folder)
+    weights = regressor_weights(folder.best_checkpoint)
+    # the user's own networks may need their numbers
+    if not custom_parts({"head": config.model.head, "backbone": config.backbone}):
+        with torch.device("meta"), _Uninitialised():
+            fill(_stored(folder, config, depth), weights, folder.best_checkpoint, assign=True)
+    regressor = _stored(folder, config, depth)
+    fill(regressor, weights, folder.best_checkpoint)
+    return regressor
+
+
+class _Uninitialised(TorchFunctionMode):
+    """Leaves out normal random numbers, for which torch imports its compiler where tensors have no memory."""
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        return args[0] if func is torch.Tensor.normal_ else func(*args, **(kwargs or {}))
+
+
+def _stored(folder: RunFolder, config: RunConfig, depth: DepthScale) -> Regressor:
+    """A network that a run folder describes, which may be of another version, or a stranger's."""
+    try:
+        return build_regressor(config, depth, is_new=False)
+    except UserError as error:
+        if not is_ours([config.model.head, config.backbone]):
+            raise
+        raise ConfigError(f"{error}{OTHER_VERSION}") from error
+    except Exception as error:  # parts that a stranger has named may raise any
+        reason = f"{type(error).__name__}: {gist(error)}"
+        raise ConfigError(f"{folder.config_file}: describes no network ({reason}){OTHER_VERSION}") from error
 
 
 @contextmanager

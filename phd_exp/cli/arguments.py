@@ -132,8 +132,8 @@ def loaded(arguments: RunArguments, device: str = "auto", coverage: Coverage = N
     guarantees = coverage is not None
     if arguments.calibration:
         return predictor.calibrated(arguments.calibration, guarantees=guarantees)
-    if predictor.views > 1 and (arguments.recalibrate or coverage) and not arguments.run[0].is_file():
-        _record_held_out_views(predictor, trust)
+    if predictor.network.views > 1 and (arguments.recalibrate or coverage) and not arguments.run[0].is_file():
+        _record_held_out_views(predictor)
     return predictor.recalibrated(guarantees=guarantees) if arguments.recalibrate else predictor
 
 
@@ -154,14 +154,14 @@ def _without_collector() -> Iterator[None]:
         gc.enable()
 
 
-def _record_held_out_views(predictor: "Predictor", trust: tuple[str, ...]) -> None:
+def _record_held_out_views(predictor: "Predictor") -> None:
     """Record the eight views of a finished run's held-out samples, unless they are recorded.
 
     Raises RunError if its data set is not there. Does nothing where `Predictor.held_out` names what is missing.
     """
     from phd_exp.build import build_source
     from phd_exp.config import SourceConfig
-    from phd_exp.inference import tables
+    from phd_exp.training import tables
 
     folder, data = predictor.folders[0], predictor.config.data
     file = folder.eight_views["held_out"]
@@ -171,7 +171,7 @@ def _record_held_out_views(predictor: "Predictor", trust: tuple[str, ...]) -> No
         return
     if not tables.is_recorded(file, tables.of_camera(predictor.config)):
         try:
-            tables.record_held_out_views(predictor, build_source(data), trust)
+            tables.record_held_out_views(folder, predictor.config, build_source(data))
         except DatasetError as error:
             raise RunError(f"{file}: missing, and cannot be recorded without the data set: {error}") from None
 
@@ -193,17 +193,17 @@ def predicted(
 
     each = detections if detector is None else chain.from_iterable(_found(detector, detections))
     seen = sightings(predictor, each, guarantee)
-    near = seen if beyond else _without_far(seen, needs_all)
+    near = seen if beyond else _without_far(predictor, seen, needs_all)
     noted = noting(near, lambda one: (one.detection.where, one.warnings), "predictions")
     total = len(detections) if detector is None else None
     return noted if len(detections) == 1 else with_bar(noted, "predicting", total)
 
 
-def _without_far(seen: Iterable["Sighting"], needs_all: bool) -> Iterator["Sighting"]:
+def _without_far(predictor: "Predictor", seen: Iterable["Sighting"], needs_all: bool) -> Iterator["Sighting"]:
     """The predictions from views that are not far beyond the training; afterwards DatasetError names the others."""
     n, refused = 0, list[str]()
     for n, one in enumerate(seen, 1):
-        if reason := one.batch.ranges.refusal(one.view.camera):
+        if reason := predictor.ranges.refusal(one.view.camera):
             refused.append(f"{one.detection.where}: {reason}")
             if needs_all or n == len(refused) == SEVERAL:
                 break

@@ -40,8 +40,8 @@ def main(words: list[str]) -> int:
     require_output(file, str(file.relative_to(arguments.run)), arguments, key="name")
     from phd_exp.data.sources import blocks
     from phd_exp.evaluation.conformal import samples_needed
+    from phd_exp.inference.labelled import record_labelled
     from phd_exp.inference.loading import load
-    from phd_exp.inference.tables import record_labelled
 
     predictor = load(arguments.run, trust=trusted(arguments.trust), margin=arguments.margin)
     table, name = record_labelled(predictor, detections, arguments.name), arguments.name

@@ -141,11 +141,11 @@ def _of_recorded_scenes(
     from phd_exp.evaluation.conformal import fused_guarantee
     from phd_exp.evaluation.fusion import shared_share
     from phd_exp.evaluation.several_views import read_views
-    from phd_exp.inference.tables import require_received
+    from phd_exp.training.tables import require_received
 
     file, guarantees, shared = predictor.folders[0].views, {}, None
     if arguments.coverage:
-        if predictor.is_ensemble:
+        if predictor.network.is_ensemble:
             raise ConfigError(ONE_RUN)
         require_received(file, predictor.config)
         guarantees = {k: fused_guarantee(file, k, arguments.coverage, predictor.temperature) for k in cameras}

@@ -92,15 +92,13 @@ def main(words: list[str]) -> int:
     if out is not None and out.suffix != MCAP:
         _write(predictor, sightings, len(detections), out, curve, guarantee)
         return 0
-    from phd_exp.inference.answers import answer
-
     with message_file(out) as messages:
         if messages is not None:
             from phd_exp.inference.ros import write_predictions
 
             sightings = write_predictions(messages, sightings)
         for sighting in sightings:
-            print(json.dumps(answer(sighting, predictor.temperature), allow_nan=False), flush=True)
+            print(json.dumps(sighting.line, allow_nan=False), flush=True)
     return 0
 
 
@@ -132,7 +130,6 @@ def _write(
     predictor: "Predictor", sightings: Iterable["Sighting"], n: int, out: Path, curve: Any, guarantee: Any
 ) -> None:
     """Write each line of `predictions.jsonl` before its picture, whose name begins with the line's number."""
-    from phd_exp.inference.answers import answer
     from phd_exp.inference.pictures import picture
 
     with (
@@ -142,7 +139,7 @@ def _write(
     ):
         for number, sighting in enumerate(sightings, start=1):
             name = _picture(number, n, sighting.detection)
-            line = answer(sighting, predictor.temperature) | {"picture": name}
+            line = sighting.line | {"picture": name}
             lines.write(json.dumps(line, allow_nan=False) + "\n")
             written.write(name, picture(sighting, line, curve, guarantee))
     announce(f"{out / LINES}, and a picture for each line")

@@ -19,14 +19,14 @@ from phd_exp.records.messages import optical_frame
 from phd_exp.records.own_images import detections_in, tracks_of
 from phd_exp.records.processes import announce
 from phd_exp.records.recordings import MCAP, is_recording
-from phd_exp.records.videos import length_of, require_av, shots_in
+from phd_exp.records.videos import length_of, require_av
 from phd_exp.records.written import Written
 
 if TYPE_CHECKING:  # imports of seconds, which follow the checks of the arguments
     from phd_exp.inference.detectors import Detector
     from phd_exp.inference.following import Followed, Frame
     from phd_exp.inference.predictor import Predictor
-    from phd_exp.inference.rerun_recording import SceneFile
+    from phd_exp.inference.rerun_view import SceneFile
 
 Box = tuple[float, float, float, float]
 AFTER_LOSS = "boxes= begins another track; a larger noise= follows faster motion, least_familiar=0.01 a hidden object"
@@ -124,33 +124,33 @@ def _recording(
 
 
 def _sequences(arguments: TrackArguments) -> Iterator[_Sequence]:
-    recording = arguments.recording(arguments.folder)
-    if arguments.folder and not recording:
-        tracks = tracks_of(detections_in(arguments.folder))
-        from phd_exp.inference.frames import folder_frames
+    recording, folder, stride = arguments.recording(arguments.folder), arguments.folder, arguments.stride
+    if folder and not recording:
+        tracks = tracks_of(detections_in(folder))
+        from phd_exp.inference.frames import of_folder
 
         for name, detections in tracks.items():
-            frames = folder_frames(detections, has_boxes=bool(arguments.function))
-            yield _Sequence(frames, len(detections), str(arguments.folder.name if name is None else name))
+            frames = of_folder(detections, has_boxes=bool(arguments.function))
+            yield _Sequence(frames, len(detections), str(folder.name if name is None else name))
         return
     boxes: dict[int, list[Box]] | None = {} if arguments.function else None
     if arguments.boxes and not arguments.function:
         boxes = _boxes_of_frames(arguments.boxes, arguments.object)
     elif arguments.box:
         boxes = {0: [arguments.box]}
-    video, stride = arguments.video, arguments.stride
-    length = len(recording) if recording else length_of(Path(str(video)))
+    video = Path(str(arguments.video))
+    length = len(recording) if recording else length_of(video)
     if boxes:
         _require_frames(boxes, length, stride)
-    from phd_exp.inference.frames import recorded_shots, video_frames
+    from phd_exp.inference.frames import of_recording, of_video
 
     n = length and -(-length // stride)
     if recording:
-        frames = video_frames(recording.template, boxes, recorded_shots(recording, stride))
+        frames = of_recording(recording, boxes, stride)
         yield _Sequence(frames, n, recording.path.stem, recording.start, recording.frame)
-    elif video:
-        (detection,) = detections_of([video], arguments.of_camera)
-        yield _Sequence(video_frames(detection, boxes, shots_in(video, stride)), n, video.stem)
+    else:
+        (camera,) = detections_of([video], arguments.of_camera)
+        yield _Sequence(of_video(video, camera, boxes, stride), n, video.stem)
 
 
 def _require_frames(boxes: dict[int, list[Box]], length: int | None, stride: int) -> None:
@@ -190,15 +190,13 @@ def _followed(
     from phd_exp.fusion.tracks import ConstantVelocity, Slow
     from phd_exp.inference.following import follow
 
-    slow = Slow(arguments.depth_time, arguments.projection_time)
-    motion, least = ConstantVelocity(arguments.noise, arguments.speed), arguments.least_familiar
     followed = follow(
         predictor,
         sequence.frames,
-        motion,
+        ConstantVelocity(arguments.noise, arguments.speed),
         arguments.lag,
-        slow,
-        least_familiar=least,
+        Slow(arguments.depth_time, arguments.projection_time),
+        least_familiar=arguments.least_familiar,
         detector=detector,
         beyond=arguments.beyond,
     )

@@ -60,8 +60,8 @@ def task(config: dict[str, Any], overrides: list[str], cores: int, callbacks: Se
     """
     checked = checked_start(config, overrides)
     # imports of seconds, which follow the check of the configuration
-    from phd_exp.inference.further import record_further
     from phd_exp.training.pruning import held_out_score
+    from phd_exp.training.tables import record_tables
     from phd_exp.training.train import require_possible, train
 
     folder, render = RunFolder(run_name(checked, overrides).folder(checked.runs)), partial(rendered, cores=cores)
@@ -71,7 +71,7 @@ def task(config: dict[str, Any], overrides: list[str], cores: int, callbacks: Se
         announce(checked, folder, overrides)
     own = [str(item.input_line) for item in _unnamed(overrides)]
     results = train(checked, folder, _draw(), cores, callbacks, own, render)
-    record_further(folder, checked, render)
+    record_tables(folder, checked, render)
     print(f"{folder.path}: {'finished already' if skipped else 'finished'}")
     for key in filter(results.__contains__, SHOWN):
         print(f"  {key} {_number(results[key])} (untrained {_number(results.get(f'untrained/{key}'))})")

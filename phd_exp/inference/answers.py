@@ -1,7 +1,7 @@
 """Detections in image files, each predicted by a network, and the predictions as JSON objects."""
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -10,23 +10,21 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
 from phd_exp.data.cache import DECODERS, LARGEST_AT_ONCE
-from phd_exp.data.crops import cut, read_image, true_position
+from phd_exp.data.crops import read_image, true_position
 from phd_exp.distributions import Density, ProjectedHuber, Temperature
 from phd_exp.distributions.along import quantiles_along
 from phd_exp.geometry.camera import Camera
-from phd_exp.inference.predictor import BATCH, Predictor
-from phd_exp.inference.ranges import UNKNOWN, Ranges
+from phd_exp.inference.predictor import PredictedViews, Predictor
 from phd_exp.inference.views import View
 from phd_exp.metrics.errors import MILLIMETRES, depth_error, projected_error
-from phd_exp.models.heads import Prediction
-from phd_exp.optics.virtual import VirtualCamera
+from phd_exp.models.trained import BATCH
 from phd_exp.records.detections import Detection
-from phd_exp.records.errors import DatasetError, RunError, UserError
+from phd_exp.records.errors import DatasetError, UserError
 from phd_exp.records.images import pillow_warnings
 
 if TYPE_CHECKING:  # imports of pyarrow
@@ -43,36 +41,23 @@ NONE = "none: this model predicts a position alone"
 
 
 @dataclass(frozen=True, eq=False)
-class PredictedBatch:
-    """Detections that are predicted together, with their images.
+class Answers:
+    """Detections that are predicted together, with what their answers have in common.
 
-    `predictions` are in the frames of the views (float64), made by `Predictor.predict` from `raw`, the outputs of the
-    network; `familiar` is of runs with held-out samples; a `guarantee` gives each prediction a region; `ranges` of
-    the training give warnings.
+    Args:
+        detections: a row for each view of `found`.
+        found: the predictions, in the frames of the views.
+        guarantee: gives each prediction a region.
     """
 
-    seen: Sequence[tuple[Detection, Image.Image, View]]
-    raw: Float[Tensor, "batch *members n_outputs"]
-    predictions: Prediction
-    familiar: Float[np.ndarray, " batch"] | None = None
+    detections: Sequence[Detection]
+    found: PredictedViews
     guarantee: "Guarantee | None" = None
-    ranges: Ranges = UNKNOWN
-
-    @property
-    def cameras(self) -> Camera:
-        """The cameras of the views."""
-        f = [view.camera.f for _, _, view in self.seen]
-        return Camera(torch.tensor(f, dtype=torch.float64), self.seen[0][2].camera.S)
-
-    @property
-    def R(self) -> Float[np.ndarray, "batch 3 3"]:
-        """The rotations from the frames of the real cameras to those of the views."""
-        return np.stack([view.camera.R for _, _, view in self.seen])
 
     @cached_property
-    def out_of_field(self) -> Bool[np.ndarray, " batch"]:
-        """Whether the mode lies outside the field of the view."""
-        return ~self.cameras.contains(self.predictions.mode).numpy()
+    def R(self) -> Float[np.ndarray, "batch 3 3"]:
+        """The rotations from the frames of the real cameras to those of the views."""
+        return np.stack([view.camera.R for view in self.found.views])
 
     @cached_property
     def numbers(self) -> dict[str, Float[np.ndarray, "batch ..."]]:
@@ -83,7 +68,7 @@ class PredictedBatch:
         integrated along the axis of the real camera (`quantiles_along`). They are NaN where the mode lies 90 degrees
         or more from it.
         """
-        made, R = self.predictions, self.R
+        made, R = self.found.predictions, self.R
         mode = made.mode.numpy()
         found = {"mode": _turned_back(mode, R)}
         if made.has_closed_forms:
@@ -97,54 +82,65 @@ class PredictedBatch:
         return found
 
     @cached_property
-    def errors(self) -> dict[str, Float[np.ndarray, " batch"]]:
-        """The errors of the tables, which rotating the camera does not change, and the scores of a distribution.
-
-        NaN where the true position is unknown.
-        """
-        made, known = self.predictions, torch.tensor([one.line.z is not None for one, *_ in self.seen])
-        truth = made.mode.clone()  # where it is unknown, a position that every density accepts
-        for row in known.nonzero().flatten().tolist():
-            detection, _, view = self.seen[row]
-            truth[row] = torch.from_numpy(view.camera.to_virtual(np.array(detection.position)))
-        errors = {
-            "projected_error_mm": MILLIMETRES * projected_error(truth, made.mode),
-            "depth_error_mm": MILLIMETRES * depth_error(truth, made.mode),
-        }
-        if isinstance(made, Density):
-            errors |= {"credible_level": made.level(truth), "nll": -made.log_prob(truth)}
-        return {name: value.masked_fill(~known, torch.nan).numpy() for name, value in errors.items()}
+    def truth(self) -> Float[np.ndarray, "batch 3"]:
+        """The true positions in the frames of the views, m; NaN where they are unknown."""
+        return np.stack(
+            [
+                np.full(3, np.nan) if one.line.z is None else view.camera.to_virtual(np.array(one.position))
+                for one, view in zip(self.detections, self.found.views, strict=True)
+            ]
+        )
 
     @cached_property
-    def positions(self) -> list[dict[str, Any]]:
-        """The `numbers` of each detection, for JSON; a baseline has its position alone."""
-        columns = {name: rounded(values) for name, values in self.numbers.items()}
-        if "depth_interval" in columns:
+    def lines(self) -> list[dict[str, Any]]:
+        """The numbers of each detection for JSON, a baseline's position alone.
+
+        With the region of a guarantee, `familiar` if it is known, and errors if the true position is known.
+        """
+        columns, made = {name: rounded(values) for name, values in self.numbers.items()}, self.found.predictions
+        if made.has_closed_forms:
             columns["depth_interval"] = [
                 {str(level): None if None in ends else ends for level, ends in zip(PER_CENT, intervals, strict=True)}
                 for intervals in columns["depth_interval"]
             ]
         else:
             columns = {"position": columns["mode"]}
-        return _rows(columns)
+        columns |= {"uncertainty": [self._uncertainty()] * len(self.R), "warnings": self.found.warnings}
+        cameras = Camera(self.found.f, float(self.found.predictor.side))
+        if self.guarantee and made.has_closed_forms:
+            columns["region"] = self._regions(self.guarantee, made, cameras)
+        if self.found.familiar is not None:
+            columns["familiar"] = rounded(np.array(self.found.familiar))
+        columns["out_of_field"] = (~cameras.contains(made.mode)).tolist()
+        rows, known = _rows(columns), np.isfinite(self.truth[:, 2])
+        if known.any():
+            errors = _rows({name: rounded(values) for name, values in self._errors().items()})
+            rows = [row | (more if is_known else {}) for row, more, is_known in zip(rows, errors, known, strict=True)]
+        return rows
 
-    @cached_property
-    def scores(self) -> list[dict[str, Any]]:
-        """The region of each detection, its familiarity, and its errors if the position is known, for JSON."""
-        columns: dict[str, Any] = {}
-        if self.guarantee and self.predictions.has_closed_forms:
-            columns["region"] = self._regions(self.guarantee, self.predictions)
-        if self.familiar is not None:
-            columns["familiar"] = rounded(self.familiar)
-        found = _rows(columns | {"out_of_field": self.out_of_field.tolist()})
-        is_known = [one.line.z is not None for one, *_ in self.seen]
-        if not any(is_known):
-            return found
-        errors = _rows({name: rounded(values) for name, values in self.errors.items()})
-        return [row | more if known else row for row, more, known in zip(found, errors, is_known, strict=True)]
+    def _uncertainty(self) -> str:
+        made = self.found.predictions
+        if made.has_closed_forms:
+            return uncertainty(self.found.predictor.temperature)
+        return "not reported: no Projected Huber density" if isinstance(made, Density) else NONE
 
-    def _regions(self, guarantee: "Guarantee", predictions: ProjectedHuber) -> list[dict[str, Any]]:
-        regions, facts = guarantee.regions(predictions, (self.cameras.f / self.cameras.S).numpy())
+    def _errors(self) -> dict[str, Float[np.ndarray, " batch"]]:
+        """The errors of the tables, which rotating the camera does not change, and the scores of a distribution.
+
+        They mean nothing where the true position is unknown: it is replaced by one that every density accepts.
+        """
+        made, truth = self.found.predictions, torch.from_numpy(self.truth)
+        truth = torch.where(truth.isnan(), made.mode, truth)
+        errors = {
+            "projected_error_mm": MILLIMETRES * projected_error(truth, made.mode),
+            "depth_error_mm": MILLIMETRES * depth_error(truth, made.mode),
+        }
+        if isinstance(made, Density):
+            errors |= {"credible_level": made.level(truth), "nll": -made.log_prob(truth)}
+        return {name: value.numpy() for name, value in errors.items()}
+
+    def _regions(self, guarantee: "Guarantee", predictions: ProjectedHuber, cameras: Camera) -> list[dict[str, Any]]:
+        regions, facts = guarantee.regions(predictions, (cameras.f / cameras.S).numpy())
         extent = np.stack(regions.depth_interval(self.R[:, :, 2]), axis=-1)
         numbers = _rows({"depth_interval": rounded(extent), "volume": rounded(regions.volume)})
         return [{**one, **more} for one, more in zip(facts, numbers, strict=True)]
@@ -152,41 +148,65 @@ class PredictedBatch:
 
 @dataclass(frozen=True, eq=False)
 class Sighting:
-    """One detection with its image, the input of the network, and its row of a predicted batch."""
+    """One detection with its image, and its row of answers."""
 
     detection: Detection
     image: Image.Image
-    view: View
-    batch: PredictedBatch
+    answers: Answers
     row: int
+
+    @property
+    def view(self) -> View:
+        """The input of the network."""
+        return self.answers.found.views[self.row]
 
     @property
     def raw(self) -> Float[Tensor, "*members n_outputs"]:
         """The outputs of the network."""
-        return self.batch.raw[self.row]
+        return self.answers.found.raw[self.row]
 
     @property
     def density(self) -> ProjectedHuber | None:
         """The prediction, unless it is another density or a position alone."""
-        made = self.batch.predictions
+        made = self.answers.found.predictions
         return made[self.row] if made.has_closed_forms else None
 
     @property
     def mode(self) -> Float[np.ndarray, "3"]:
         """The most likely position, or the one that is predicted alone, in the frame of the view, m."""
-        mode: np.ndarray = self.batch.predictions.mode[self.row].numpy()
+        mode: np.ndarray = self.answers.found.predictions.mode[self.row].numpy()
         return mode
+
+    @property
+    def truth(self) -> Float[np.ndarray, "3"] | None:
+        """The true position in the frame of the view, m, if it is known."""
+        return None if self.detection.line.z is None else self.answers.truth[self.row]
+
+    @property
+    def truth_ahead(self) -> Float[np.ndarray, "3"] | None:
+        """The true position, if it is known and the view contains its direction."""
+        return self.truth if self.truth is not None and self.truth[2] > 0 else None
+
+    @property
+    def numbers(self) -> dict[str, Float[np.ndarray, "..."]]:
+        """Its row of `Answers.numbers`."""
+        return {name: values[self.row] for name, values in self.answers.numbers.items()}
 
     @property
     def familiar(self) -> float | None:
         """Its p-value among held-out samples."""
-        return None if self.batch.familiar is None else float(self.batch.familiar[self.row])
+        return None if self.answers.found.familiar is None else self.answers.found.familiar[self.row]
 
     @property
     def warnings(self) -> list[str]:
         """What is beyond the training, see `Ranges.warnings`."""
-        size = self.image.size
-        return self.batch.ranges.warnings(self.view.camera, self.mode, self.detection.box(*size), size, self.familiar)
+        return self.answers.found.warnings[self.row]
+
+    @property
+    def line(self) -> dict[str, Any]:
+        """The keys of the detection and its row of `Answers.lines`, for JSON."""
+        named = self.detection.line.model_dump(include=set(REPEATED), exclude_none=True, mode="json")
+        return named | self.answers.lines[self.row]
 
 
 def _turned_back(
@@ -196,9 +216,12 @@ def _turned_back(
     return (points[:, None] @ R)[:, 0]
 
 
-def _rows(columns: Mapping[str, Sequence[Any]]) -> list[dict[str, Any]]:
+def _rows(columns: dict[str, Sequence[Any]]) -> list[dict[str, Any]]:
     """The rows of columns of equal length."""
     return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+
+
+Seen = tuple[Detection, Image.Image, View]
 
 
 def sightings(
@@ -209,29 +232,18 @@ def sightings(
     Raises DatasetError, naming the file, for an invalid image, and RunError if a network output is not finite.
     """
     for seen in _batches(predictor, detections):
-        f = torch.tensor([view.camera.f for _, _, view in seen], dtype=torch.float64)
-        raw = predictor.raw(np.stack([view.image for _, _, view in seen]), f)
-        finite = raw.flatten(1).isfinite().all(-1)
-        n = int(finite.long().cumprod(0).sum())  # of those before the first that is not
-        if n:
-            made = predictor.predict(raw[:n], f[:n])
-            familiar = predictor.familiar(raw[:n], f[:n], made)
-            batch = PredictedBatch(seen[:n], raw[:n], made, familiar, guarantee, predictor.ranges)
-            yield from (Sighting(*one, batch, row) for row, one in enumerate(batch.seen))
-        if n < len(seen):
-            raise RunError(
-                f"{seen[n][0].where}: the network returns numbers that are not finite; train the run again"
-            )
-
-
-Seen = tuple[Detection, Image.Image, View]
+        each, images, views = zip(*seen, strict=True)
+        answers = Answers(each, predictor.predicted(views), guarantee)
+        yield from (
+            Sighting(one, image, answers, row) for row, (one, image) in enumerate(zip(each, images, strict=True))
+        )
 
 
 def _batches(predictor: Predictor, detections: Iterable[Detection]) -> Iterator[list[Seen]]:
     """Detections with image and view; consecutive detections in one file share its image.
 
-    A batch ends with the file that completes `BATCH` detections or exceeds `LARGEST_AT_ONCE` pixels. As many files as
-    torch has threads are decoded at the same time.
+    A batch ends with the file that completes `BATCH` detections or exceeds `LARGEST_AT_ONCE` pixels, and before the
+    first error. As many files as torch has threads are decoded at the same time.
     """
     threads = min(DECODERS, torch.get_num_threads())
     files = _with_error(together(detections, lambda one: one.file, BATCH))
@@ -239,13 +251,13 @@ def _batches(predictor: Predictor, detections: Iterable[Detection]) -> Iterator[
     with ThreadPoolExecutor(threads) as pool:
         while some := list(islice(files, threads)):
             with pillow_warnings():
-                seen = list(pool.map(partial(_seen, predictor), some))
-            for found, error in seen:
-                batch += found
-                if error:
+                decoded = list(pool.map(partial(_seen, predictor), some))
+            for found in decoded:
+                batch += [one for one in found if not isinstance(one, UserError)]
+                if found and isinstance(found[-1], UserError):
                     if batch:
                         yield batch  # the predictions before the invalid image are not lost
-                    raise error
+                    raise found[-1]
             pixels = sum({id(image): image.width * image.height for _, image, _ in batch}.values())
             if len(batch) >= BATCH or pixels > LARGEST_AT_ONCE:
                 yield batch
@@ -257,16 +269,13 @@ def _batches(predictor: Predictor, detections: Iterable[Detection]) -> Iterator[
 def together(items: Iterable[Item], key: Callable[[Item], object], most: float = math.inf) -> Iterator[list[Item]]:
     """Consecutive items with the same key, at most so many; also the last ones before a UserError."""
     same: list[Item] = []
-    try:
-        for item in items:
-            if same and (key(item) != key(same[0]) or len(same) == most):
-                yield same
-                same = []
-            same.append(item)
-    except UserError:
-        if same:
+    for item in _with_error(items):
+        if same and (isinstance(item, UserError) or key(item) != key(same[0]) or len(same) == most):
             yield same
-        raise
+            same = []
+        if isinstance(item, UserError):
+            raise item
+        same.append(item)
     if same:
         yield same
 
@@ -279,49 +288,28 @@ def _with_error(items: Iterable[Item]) -> Iterator[Item | UserError]:
         yield error
 
 
-def _seen(predictor: Predictor, detections: list[Detection] | UserError) -> tuple[list[Seen], UserError | None]:
+def _seen(predictor: Predictor, detections: list[Detection] | UserError) -> list[Seen | UserError]:
     """The detections in one file, those before the first that is invalid, and its error."""
     if isinstance(detections, UserError):
-        return [], detections
-    found: list[Seen] = []
+        return [detections]
+    found: list[Seen | UserError] = []
     try:
         image = read_image(detections[0].file, detections[0].content)
         for detection in detections:
-            camera = _facing(predictor, detection, image.size)
+            K, lens = detection.optics(*image.size)
+            box = detection.box(*image.size) if detection.line.box else None
+            view = predictor.view(image, K, box, lens, detection.where)
             if detection.line.z is not None:
-                true_position(detection, image.size, camera, predictor.widest)
-            found.append((detection, image, View(cut(image, camera), camera)))
+                true_position(detection, image.size, view.camera, predictor.widest)
+            found.append((detection, image, view))
     except DatasetError as error:
-        return found, error
-    return found, None
-
-
-def _facing(predictor: Predictor, detection: Detection, size: tuple[int, int]) -> VirtualCamera:
-    """The camera of the view of a detection. Raises DatasetError as `data.crops.facing`."""
-    box = detection.box(*size)
-    K, lens = detection.optics(*size)
-    try:
-        return predictor.virtual_camera(K, size, box if detection.line.box else None, lens)
-    except ValueError as error:
-        raise DatasetError(f"{detection.where}: {error}") from None
-
-
-def answer(sighting: Sighting, temperature: Temperature | None) -> dict[str, Any]:
-    """The numbers of a detection for JSON, its region, and its errors if the position is known."""
-    batch, row, made = sighting.batch, sighting.row, sighting.batch.predictions
-    named: dict[str, Any] = sighting.detection.line.model_dump(include=set(REPEATED), exclude_none=True, mode="json")
-    if made.has_closed_forms:
-        origin = uncertainty(temperature)
-    else:
-        origin = "not reported: no Projected Huber density" if isinstance(made, Density) else NONE
-    return named | batch.positions[row] | {"uncertainty": origin, "warnings": sighting.warnings} | batch.scores[row]
+        found.append(error)
+    return found
 
 
 def uncertainty(temperature: Temperature | None) -> str:
     """The origin of the uncertainty: as trained, or recalibrated."""
-    if temperature is None:
-        return "as trained"
-    return f"recalibrated: {temperature}"
+    return "as trained" if temperature is None else f"recalibrated: {temperature}"
 
 
 def rounded(values: Float[np.ndarray, "..."]) -> Any:

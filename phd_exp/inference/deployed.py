@@ -17,8 +17,9 @@ from phd_exp.data.areas import area_means, sums
 from phd_exp.distributions.gaussian_mixture import GaussianMixture
 from phd_exp.geometry.facing import facing, pixel_corners
 from phd_exp.inference.answers import PER_CENT
-from phd_exp.inference.predictor import PIXELS, Predictor
+from phd_exp.inference.predictor import Predictor
 from phd_exp.models.heads import Prediction
+from phd_exp.models.trained import PIXELS
 from phd_exp.optics.virtual import intrinsics
 from phd_exp.records.errors import ConfigError
 
@@ -44,7 +45,7 @@ class Deployed(nn.Module, ABC):
     def __init__(self, predictor: Predictor, precision: Precision = "float32") -> None:
         super().__init__()
         self.predictor, self.dtype = predictor, torch.float32 if precision == "float32" else torch.float64
-        self.networks = nn.ModuleList(predictor.networks)
+        self.network = predictor.network
 
     @abstractmethod
     def cases(self) -> Iterator[tuple[tuple[Tensor, ...], Tensor, Prediction]]:
@@ -67,7 +68,7 @@ class OfImages(Deployed):
     dynamic_shapes = ({0: NUMBER}, {0: NUMBER})
 
     def forward(self, image: UInt8[Tensor, "batch S S 3"], f: Float[Tensor, " batch"]) -> tuple[Tensor, ...]:
-        raw = self.predictor.outputs(image, self.predictor.camera(f).f)
+        raw = self.network.outputs(image, self.network.camera(f).f)
         answers = self.answers(self.predictor.predict(raw, f, self.dtype), image, f)
         return self.outputs((f > 0) & f.isfinite(), raw, answers.values())
 
@@ -96,9 +97,9 @@ class OfPhotographs(Deployed):
         lower, upper = boxes.tensor_split(2, dim=-1)
         further = (self.predictor.margin - 1) * (upper - lower) / 2
         seen = torch.cat([lower - further, upper + further], dim=-1)
-        R, f = facing(K, seen, self.predictor.side, self.predictor.largest_f)
+        R, f = facing(K, seen, self.predictor.side, self.predictor.f_range[1])
         image = area_means(sums(photograph), *pixel_corners(K, seen, R, f, self.predictor.side))
-        raw = self.predictor.outputs(image, self.predictor.camera(f.float()).f)
+        raw = self.network.outputs(image, self.network.camera(f.float()).f)
         answers = self.answers(self.predictor.predict(raw, f.float(), self.dtype), photograph, K, boxes)
         left, top, right, bottom = boxes.unbind(-1)
         height, width = photograph.shape[:2]
@@ -108,7 +109,7 @@ class OfPhotographs(Deployed):
 
     def answers(self, prediction: Prediction, *inputs: Tensor) -> dict[str, Tensor]:
         K, boxes = (value.to(prediction.mode.dtype) for value in inputs[1:])
-        R, _ = facing(K, boxes, self.predictor.side, self.predictor.largest_f)
+        R, _ = facing(K, boxes, self.predictor.side, self.predictor.f_range[1])
         here = answers(prediction)
         for name in ("mode", "mean", "position"):
             if name in here:
@@ -136,7 +137,7 @@ class OfPhotographs(Deployed):
 
 def require_exportable(predictor: Predictor) -> None:
     """Raise ConfigError for a density whose answers are no graph."""
-    if predictor.regressor.head.prediction is GaussianMixture:
+    if predictor.network.head.prediction is GaussianMixture:
         raise ConfigError(
             f"{predictor.config.model.name}: cannot be exported, because the mode of a mixture of Gaussians needs "
             "inverse matrices, which ONNX lacks; expected a run of another model"

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,35 +18,19 @@ from phd_exp.records.errors import ConfigError, DatasetError, gist, in_user_code
 from phd_exp.records.images import pillow_warnings
 
 
-class Found(NamedTuple):
-    """The boxes in one image, in any order.
-
-    Attributes:
-        boxes: left, top, right, bottom, pixels from the top left corner of the image.
-        scores: the higher, the more certain.
-        classes: whole numbers or names.
-    """
-
-    boxes: Any
-    scores: Any
-    classes: Any
-
-
-Find = Callable[[UInt8[np.ndarray, "height width 3"]], Found]
-
-
 @dataclass(frozen=True)
 class Detector:
     """A function that finds boxes, with its name for messages.
 
     Args:
         name: the key and its value.
-        find: the function.
+        find: an RGB image -> boxes (left, top, right, bottom, px), scores, the higher the more certain, and classes,
+            whole numbers or names; in any order.
         category: the class to keep; None: all.
     """
 
     name: str
-    find: Find
+    find: Callable[[UInt8[np.ndarray, "height width 3"]], Any]
     category: int | str | None = None
 
     def boxes_in(self, image: UInt8[np.ndarray, "height width 3"], where: str) -> list[dict[str, Any]]:
@@ -119,10 +103,7 @@ def overlap(one: Box, other: Box) -> float:
         >>> overlap((0.0, 0.0, 2.0, 2.0), (1.0, 0.0, 3.0, 2.0)) == 1 / 3
         True
     """
-    common = _area((max(one[0], other[0]), max(one[1], other[1]), min(one[2], other[2]), min(one[3], other[3])))
-    return common / (_area(one) + _area(other) - common)
-
-
-def _area(box: Box) -> float:
-    """Area of a box; 0 if it is reversed."""
-    return max(0.0, box[2] - box[0]) * max(0.0, box[3] - box[1])
+    sizes = [max(0.0, box[2] - box[0]) * max(0.0, box[3] - box[1]) for box in (one, other)]
+    width, height = (min(one[axis + 2], other[axis + 2]) - max(one[axis], other[axis]) for axis in (0, 1))
+    common = max(0.0, width) * max(0.0, height)
+    return common / (sum(sizes) - common)

@@ -2,15 +2,14 @@
 
 from collections import deque
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
-from typing import Any, Literal, NamedTuple
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 from scipy import special
 
-from phd_exp.data.crops import cut
 from phd_exp.distributions import ProjectedHuber
 from phd_exp.fusion import Pose
 from phd_exp.fusion.tracks import ConstantVelocity, Lost, Slow, State, Tracker
@@ -20,7 +19,7 @@ from phd_exp.inference.detectors import Detector, overlap
 from phd_exp.inference.predictor import Predictor
 from phd_exp.optics.lens import PINHOLE, Lens
 from phd_exp.optics.virtual import Box, VirtualCamera, rays, towards
-from phd_exp.records.errors import DatasetError, RunError, UserError, gist
+from phd_exp.records.errors import DatasetError, UserError, gist
 
 USUAL = ConstantVelocity(noise=1.0)
 SPREADS = 2.0  # standard deviations of the predicted position by which each side of its box is moved outwards
@@ -85,6 +84,11 @@ class Followed:
         R = self.frame.pose.R.numpy()
         mean = self.frame.pose.into_camera(self.state.mean).numpy()
         return mean, R @ self.state.covariance.numpy() @ R.T
+
+    @property
+    def facing(self) -> VirtualCamera:
+        """The camera of the frame turned towards the mean position, with an image of one pixel."""
+        return VirtualCamera(self.frame.K, towards(self.in_camera[0]), 1.0, 1.0, self.frame.lens)
 
     def answer(self, predictor: Predictor) -> dict[str, Any]:
         """The numbers of the frame as a JSON object; metres and seconds, in the world of the poses."""
@@ -154,41 +158,19 @@ def follow(
     yield from current.finish()
 
 
-class _Seen(NamedTuple):
-    """The prediction in one frame.
-
-    Attributes:
-        prediction: in the frame of the virtual camera.
-        pose: of the virtual camera in the world.
-        familiar: its p-value.
-        warnings: what is beyond the training.
-        refusal: why it takes no part.
-    """
-
-    prediction: ProjectedHuber
-    pose: Pose
-    familiar: float | None
-    warnings: tuple[str, ...]
-    refusal: str | None
-
-
+@dataclass(eq=False)
 class _Track:
     """One track: its tracker, the frames that wait for their state, and the outline of the last given box."""
 
-    def __init__(
-        self,
-        predictor: Predictor,
-        tracker: Tracker,
-        number: int,
-        least_familiar: float,
-        detector: Detector | None,
-        beyond: bool,
-    ) -> None:
-        self.predictor, self.tracker, self.number, self.least_familiar = predictor, tracker, number, least_familiar
-        self.detector, self.beyond = detector, beyond
-        self.waiting: deque[Followed] = deque()
-        self.last: tuple[ProjectedHuber, Pose] | None = None  # prediction and pose of the virtual camera
-        self.outline: _Outline | None = None
+    predictor: Predictor
+    tracker: Tracker
+    number: int
+    least_familiar: float
+    detector: Detector | None
+    beyond: bool
+    waiting: deque[Followed] = field(default_factory=deque)
+    last: tuple[ProjectedHuber, Pose] | None = None  # prediction and pose of the virtual camera
+    outline: "_Outline | None" = None
 
     def add(self, number: int, frame: Frame) -> Iterator[Followed]:
         """The frames whose state is known with this one."""
@@ -233,34 +215,18 @@ class _Track:
         followed = Followed(number, frame, self.number)
         if frame.boxes is not None and box is None:
             return followed, False
-        seen = self._predict(frame, box)
-        if seen.refusal and self.last is None and self.number == 0:
-            raise DatasetError(f"{frame.where}: {seen.refusal}")
-        is_usual = self.last is None or seen.familiar is None or seen.familiar >= self.least_familiar
-        if takes_part := is_usual and not seen.refusal:
-            self.last = seen.prediction, seen.pose
-        return replace(followed, box=box, familiar=seen.familiar, warnings=seen.warnings), takes_part
-
-    def _predict(self, frame: Frame, box: Box | None) -> "_Seen":
-        """The prediction from a box, or the whole image."""
-        predictor, (height, width) = self.predictor, frame.image.shape[:2]
-        try:
-            camera = predictor.virtual_camera(frame.K, (width, height), box, frame.lens)
-        except ValueError as error:
-            raise DatasetError(f"{frame.where}: {error}") from None
-        view = cut(frame.image, camera)
-        f = torch.tensor([camera.f], dtype=torch.float64)
-        raw = predictor.raw(np.stack([view]), f)
-        if not bool(raw.isfinite().all()):
-            raise RunError(f"{frame.where}: the network returns numbers that are not finite; train the run again")
-        prediction = predictor.predict(raw, f)
-        assert prediction.has_closed_forms  # checked by `follow`
-        R, p_values = torch.from_numpy(camera.R), predictor.familiar(raw, f, prediction)
-        pose = Pose(R @ frame.pose.R, R @ frame.pose.t)
-        familiar, ranges = None if p_values is None else float(p_values[0]), predictor.ranges
-        part, mode = box or (0.0, 0.0, float(width), float(height)), prediction.mode[0].numpy()
-        warnings = ranges.warnings(camera, mode, part, (width, height), familiar)
-        return _Seen(prediction, pose, familiar, tuple(warnings), None if self.beyond else ranges.refusal(camera))
+        view = self.predictor.view(frame.image, frame.K, box, frame.lens, frame.where)
+        seen = self.predictor.predicted([view])
+        refusal = None if self.beyond else self.predictor.ranges.refusal(view.camera)
+        if refusal and self.last is None and self.number == 0:
+            raise DatasetError(f"{frame.where}: {refusal}")
+        familiar = seen.familiar[0] if seen.familiar else None
+        is_usual = self.last is None or familiar is None or familiar >= self.least_familiar
+        if takes_part := is_usual and not refusal:
+            assert seen.predictions.has_closed_forms  # checked by `follow`
+            R = torch.from_numpy(view.camera.R)
+            self.last = seen.predictions, Pose(R @ frame.pose.R, R @ frame.pose.t)
+        return replace(followed, box=box, familiar=familiar, warnings=tuple(seen.warnings[0])), takes_part
 
     def _box(self, frame: Frame) -> tuple[Box | None, bool]:
         """The part of the image to predict from, and whether the frame or the detector gives it."""
@@ -281,36 +247,35 @@ class _Track:
         return outline.box(frame, frame.pose.into_camera(torch.from_numpy(mean)).numpy(), R @ covariance @ R.T)
 
 
+@dataclass(eq=False)
 class _Outline:
     """A box as the corners of a shape that faces the camera at the object.
 
     Attributes:
         frame: of the box.
+        rays: unit vectors through its corners.
         age: how many frames followed.
         corners: relative to the object, in a frame whose third axis leads from the camera to it, metres.
     """
 
     frame: Frame
-    age: int
-    corners: Float[np.ndarray, "4 3"]
-
-    def __init__(self, box: Box, frame: Frame) -> None:
-        left, top, right, bottom = box
-        corners = np.array([[left, top], [right, top], [left, bottom], [right, bottom]])
-        self._rays = rays(frame.K, corners, frame.lens)
-        self._rays /= np.linalg.norm(self._rays, axis=-1, keepdims=True)
-        self.frame, self.age = frame, 0
+    rays: Float[np.ndarray, "4 3"]
+    age: int = 0
+    corners: Float[np.ndarray, "4 3"] = field(init=False)
 
     @classmethod
     def of(cls, box: Box, frame: Frame) -> "_Outline | None":
         """That of a box; None if a corner lies beyond the field of the lens."""
-        outline = cls(box, frame)
-        return outline if np.isfinite(outline._rays).all() else None
+        left, top, right, bottom = box
+        corners = np.array([[left, top], [right, top], [left, bottom], [right, bottom]])
+        through = rays(frame.K, corners, frame.lens)
+        through /= np.linalg.norm(through, axis=-1, keepdims=True)
+        return cls(frame, through) if np.isfinite(through).all() else None
 
     def place(self, position: Float[np.ndarray, "3"]) -> None:
         """Sets the corners, for an object at a position in the world (metres)."""
         here = self.frame.pose.into_camera(torch.from_numpy(position)).numpy()
-        self.corners = (np.linalg.norm(here) * self._rays - here) @ towards(here).T
+        self.corners = (np.linalg.norm(here) * self.rays - here) @ towards(here).T
 
     @np.errstate(invalid="ignore")  # straight behind the camera
     def box(self, frame: Frame, position: Float[np.ndarray, "3"], covariance: Float[np.ndarray, "3 3"]) -> Box | None:

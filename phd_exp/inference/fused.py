@@ -21,22 +21,6 @@ AGREE = 0.01
 """Largest distance between the true positions that lines of a scene give, relative to that from the camera."""
 
 
-def outputs(
-    scenes: Sequence[Observed], sightings: Iterable[Sighting]
-) -> tuple[Float[Tensor, "views *members n"], Float[Tensor, " views"], Pose, list[float | None], list[list[str]]]:
-    """Network outputs, focal lengths, poses of the virtual cameras in the world, `familiar` and warnings of views.
-
-    No image is kept. A virtual camera is the real one turned, v_virtual = R_v v_camera, so that its pose is
-    (R_v R, R_v t).
-    """
-    views = [(one.raw, one.view.camera, one.familiar, one.warnings) for one in sightings]
-    raw, cameras, familiar, warnings = zip(*views, strict=True)
-    R = torch.stack([torch.from_numpy(camera.R) for camera in cameras])
-    real = Pose.from_scene([pose for scene in scenes for pose in scene.poses])
-    f = torch.tensor([camera.f for camera in cameras], dtype=torch.float64)
-    return torch.stack(raw), f, Pose(R @ real.R, (R @ real.t[..., None]).squeeze(-1)), list(familiar), list(warnings)
-
-
 def fused_answers(
     scenes: Sequence[Observed],
     sightings: Iterable[Sighting],
@@ -58,32 +42,33 @@ def fused_answers(
     Raises DatasetError, before the first sighting is computed, if lines of a scene give different true positions.
     """
     truth = torch.stack([_true_position(scene) for scene in scenes])
-    raw, f, pose, familiar, warnings = outputs(scenes, sightings)
+    # no image is kept
+    views = [(one.raw, one.view.camera, one.familiar, one.warnings) for one in sightings]
+    raw, cameras, familiar, warnings = map(list, zip(*views, strict=True))
+    f = torch.tensor([camera.f for camera in cameras], dtype=torch.float64)
     # the views of each scene, padded to the most cameras, and which of them exist
     counts = [len(scene.detections) for scene in scenes]
     rows = pad_sequence(torch.arange(sum(counts)).split(counts), batch_first=True)
     mask = torch.arange(rows.shape[1]) < torch.tensor(counts)[:, None]
-    predictions = predictor.predict(raw[rows], f[rows])
+    predictions = predictor.predict(torch.stack(raw)[rows], f[rows])
     assert predictions.has_closed_forms
     way = fuse if shared_scale is None else partial(fuse_shared, share=shared_scale)
+    pose = _virtual(Pose.from_scene([pose for scene in scenes for pose in scene.poses]), [one.R for one in cameras])
     fused = way(predictions, Pose(pose.R[rows], pose.t[rows]), plane, mask)
+    directions = None if plane is None else plane.directions
     errors = {
         "error_mm": MILLIMETRES * (fused.point - truth).norm(dim=-1),
-        "squared_mahalanobis": squared_mahalanobis(
-            truth - fused.mean, fused.covariance, None if plane is None else plane.directions
-        ),
+        "squared_mahalanobis": squared_mahalanobis(truth - fused.mean, fused.covariance, directions),
     }
-    origin = {"uncertainty": uncertainty(predictor.temperature)}
-    answers = []
-    for place, scene in enumerate(scenes):
+    origin, answers, first = {"uncertainty": uncertainty(predictor.temperature)}, [], 0
+    for place, (scene, n) in enumerate(zip(scenes, counts, strict=True)):
+        names, here = [one.line.file_name for one in scene.detections], slice(first, first + n)
+        warned = [f"{one}; {name}" for name, found in zip(names, warnings[here], strict=True) for one in found]
+        unusual = {} if None in familiar[here] else {"familiar": rounded(np.array(familiar[here]))}
         known = bool(truth[place].isfinite().all())
         scores = {name: value[place].numpy() for name, value in errors.items() if known}
-        views = rows[place][mask[place]].tolist()
-        p_values = [familiar[row] for row in views]
-        names = [detection.line.file_name for detection in scene.detections]
-        warned = [f"{one}; {name}" for row, name in zip(views, names, strict=True) for one in warnings[row]]
-        unusual = {} if None in p_values else {"familiar": rounded(np.array(p_values))}
         answers.append(_answer(scene, fused, place) | origin | {"warnings": warned} | unusual | scores)
+        first += n
     return answers
 
 
@@ -101,6 +86,12 @@ def fused_region(answer: Mapping[str, Any], guarantees: Mapping[int, dict[str, A
     reach, volume = np.sqrt(scaled.diagonal()), 4 / 3 * np.pi * np.sqrt(np.linalg.det(scaled))
     extent = rounded(np.stack([mean - reach, mean + reach], -1))
     return {"region": facts | {"extent": extent, "volume": rounded(volume)}}
+
+
+def _virtual(real: Pose, R: Sequence[Float[np.ndarray, "3 3"]]) -> Pose:
+    """The poses of virtual cameras, which are real ones turned: v_virtual = R_v v_camera gives (R_v R, R_v t)."""
+    turn = torch.from_numpy(np.stack(R))
+    return Pose(turn @ real.R, (turn @ real.t[..., None]).squeeze(-1))
 
 
 def _true_position(scene: Observed) -> Float[Tensor, "3"]:

@@ -13,7 +13,6 @@ from PIL import Image, ImageDraw, ImageFont
 
 from phd_exp.distributions.level_curves import LEVELS, Points
 from phd_exp.inference.following import Followed
-from phd_exp.optics.virtual import VirtualCamera, towards
 from phd_exp.records.videos import VideoWriter
 
 Pixel = tuple[float, float]
@@ -98,8 +97,7 @@ class PathVideo:
 
 def _on_image(followed: Followed) -> list[Points]:
     """The curves on the image, pixels: linear about the mean, and bent by the lens."""
-    (mean, covariance), frame = followed.in_camera, followed.frame
-    camera = VirtualCamera(frame.K, towards(mean), 1.0, 1.0, frame.lens)
+    (mean, covariance), camera = followed.in_camera, followed.facing
     depth = np.linalg.norm(mean)
     across = (camera.R @ covariance @ camera.R.T)[:2, :2] / depth**2
     curves = [camera.real_pixels(curve) for curve in _ellipses(np.zeros(2), across)]

@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
@@ -37,7 +36,7 @@ def picture(
     curves = level_curves(sighting.density) if sighting.density else None
     on_image, above = _outlines(sighting, guarantee)
     pixels = sighting.view.camera.real_pixels
-    marks = marks_on_image(curves, sighting.mode, _truth(sighting), pixels, on_image, path_effects=_HALO)
+    marks = marks_on_image(curves, sighting.mode, sighting.truth_ahead, pixels, on_image, path_effects=_HALO)
     enlarged = _enlarged(marks, sighting.detection.box(*sighting.image.size))
     panels = 1 + (enlarged is not None) + (curves is not None) + (calibration is not None)
     figure = Figure(figsize=(max(6.0, 4.5 * panels), 4.7), layout="constrained")
@@ -124,14 +123,6 @@ def _draw_image(axes: Axes, image: Image.Image, part: Box, marks: list[Mark], fr
 def _draw_above(axes: Axes, sighting: Sighting, curves: LevelCurves, outline: Points | None, guarantee: Any) -> None:
     if outline is not None:
         axes.plot(*outline.T, "k--", label=f"{100 * guarantee.coverage:g} % guaranteed")
-    draw_birds_eye(axes, curves, _truth(sighting))
+    draw_birds_eye(axes, curves, sighting.truth_ahead)
     if not np.array_equal(sighting.view.camera.R, np.eye(3)):
         axes.set(xlabel="x (m), camera turned to the box", ylabel="z (m), camera turned to the box")
-
-
-def _truth(sighting: Sighting) -> Float[np.ndarray, "3"] | None:
-    """The true position in the frame of the virtual camera."""
-    if sighting.detection.line.z is None:
-        return None
-    truth = sighting.view.camera.to_virtual(np.array(sighting.detection.position))
-    return truth if truth[2] > 0 else None

@@ -1,4 +1,4 @@
-"""A trained network as a function, from image arrays to distributions."""
+"""A trained network as a function, from photographs to distributions."""
 
 import math
 from collections.abc import Sequence
@@ -11,19 +11,18 @@ from warnings import warn
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
+from PIL import Image
 from torch import Tensor
 
 from phd_exp.config import RenderedConfig, RunConfig
-from phd_exp.data.crops import cut
+from phd_exp.data.crops import Picture, cut
 from phd_exp.distributions import Mixture, Temperature
 from phd_exp.distributions.columns import parameter_columns
-from phd_exp.geometry.camera import Camera
 from phd_exp.geometry.charts import DepthScale
-from phd_exp.geometry.motion import EIGHT, turned
 from phd_exp.inference.ranges import Ranges
 from phd_exp.inference.views import View, focal_lengths, image_batch
-from phd_exp.models.heads import Prediction, SymmetricHead
-from phd_exp.models.regressor import Regressor
+from phd_exp.models.heads import Prediction
+from phd_exp.models.trained import TrainedNetwork
 from phd_exp.optics.lens import PINHOLE, Lens
 from phd_exp.optics.virtual import Box, VirtualCamera, enlarged, intrinsics
 from phd_exp.records.errors import ConfigError, DatasetError, RunError, listed
@@ -35,61 +34,42 @@ if TYPE_CHECKING:  # imports of pyarrow
     from phd_exp.evaluation.familiar import Familiarity
     from phd_exp.evaluation.parquet import Arrays
 
-BATCH = 64
-PIXELS = BATCH * 512**2  # of the images that a network sees at once
-
 
 @dataclass(frozen=True, eq=False)
 class Predictor:
     """A trained network, or an ensemble, in float32 whatever the precision of its training.
 
-    The members of an ensemble are networks, and for each the symmetric views of an image. It predicts the Projected
-    Huber distribution that is closest to their mixture.
-
     Args:
         config: the configuration of the run.
-        side: side of the network's image, pixels.
+        network: one network or several.
         depth: the constants that normalise depth.
-        constant_f: the focal length that the network receives for every image, px; None: the true one.
-        temperature: temperatures of recalibrated predictions; None: as trained.
         state: the state of the run, "finished" if it completed.
-        guarantees: whether the temperatures leave samples for `guarantee`.
         folders: the runs, whose held-out samples guarantee regions.
-        labelled: a record of `calibrate`, whose images replace those samples; see `calibrated`.
-        others: the further networks of an ensemble.
-        views: number of symmetric views of each image, 1 or 8.
         margin: side of the view of a box over that of the box.
+        temperature: temperatures of recalibrated predictions; None: as trained.
+        guarantees: whether the temperatures leave samples for `guarantee`.
+        labelled: a record of `calibrate`, whose images replace those samples; see `calibrated`.
     """
 
     config: RunConfig
-    regressor: Regressor
-    side: int
+    network: TrainedNetwork
     depth: DepthScale
-    constant_f: float | None
-    device: torch.device
-    temperature: Temperature | None
     state: str
-    guarantees: bool = True
-    folders: tuple[RunFolder, ...] = ()
-    labelled: Path | None = None
-    others: tuple[Regressor, ...] = ()
-    views: int = 1
+    folders: tuple[RunFolder, ...]
     margin: float = 1.0
+    temperature: Temperature | None = None
+    guarantees: bool = True
+    labelled: Path | None = None
 
     @property
-    def networks(self) -> tuple[Regressor, ...]:
-        """The network, or all networks of an ensemble."""
-        return (self.regressor, *self.others)
-
-    @property
-    def is_ensemble(self) -> bool:
-        """Whether it has several members."""
-        return bool(self.others) or self.views > 1
+    def side(self) -> int:
+        """Side of the network's image, pixels."""
+        return self.network.side
 
     @property
     def is_probabilistic(self) -> bool:
         """Whether it predicts Projected Huber densities, which alone are fused, recalibrated and drawn."""
-        return self.regressor.head.prediction.has_closed_forms
+        return self.network.head.prediction.has_closed_forms
 
     def require_densities(self, what: str) -> None:
         """Raise ConfigError, with what needs them, unless it predicts Projected Huber densities."""
@@ -111,11 +91,6 @@ class Predictor:
         low, high = data.spec.f_range
         zoom = self.side / data.spec.sensor_size
         return low * zoom, high * zoom
-
-    @property
-    def largest_f(self) -> float:
-        """The largest focal length at which boxes are viewed, px."""
-        return self.f_range[1]
 
     @property
     def widest(self) -> float:
@@ -145,18 +120,88 @@ class Predictor:
         ]
         return self.see(views if images.ndim == 4 else views[0])
 
+    def view(
+        self,
+        image: Picture,
+        K: Float[np.ndarray, "3 3"],
+        box: Box | None = None,
+        lens: Lens = PINHOLE,
+        where: str = "image",
+    ) -> View:
+        """The network's input for a box (left, top, right, bottom, px; None: all) in an image of a camera K.
+
+        A box is viewed `margin` times as large, a small one with a focal length of at most that of the training
+        images and the pixels around it. Predictions are in the frame of `view.camera`; `view.camera.to_real` maps
+        them back. `where` names the image in messages.
+
+        Raises DatasetError if the image is invalid or the box is outside the field of every pinhole camera.
+        """
+        if not isinstance(image, Image.Image):
+            (image,) = image_batch(image[None])
+        size = image.size if isinstance(image, Image.Image) else (image.shape[1], image.shape[0])
+        whole = (0.0, 0.0, float(size[0]), float(size[1]))
+        part, largest_f = (enlarged(box, self.margin), self.f_range[1]) if box else (whole, math.inf)
+        try:
+            camera = VirtualCamera.of_box(K, part, float(self.side), lens, largest_f)
+        except ValueError as error:
+            raise DatasetError(f"{where}: {error}") from None
+        return View(cut(image, camera), camera, box or whole, size, where)
+
+    def see(self, views: View | Sequence[View]) -> Prediction:
+        """Predictions for views, each in the frame of its own virtual camera.
+
+        A single view gives a prediction without a batch dimension.
+
+        Warns (UserWarning) if the focal length of a view is beyond those of the training.
+        """
+        sequence = [views] if isinstance(views, View) else views
+        if faults := list(filter(None, (self.ranges.of_view(view.camera) for view in sequence))):
+            warn(f"{len(faults)} of {len(sequence)} views, first {faults[0]}", stacklevel=2)
+        seen = self.predicted(sequence)
+        return seen.predictions if sequence is views else self.predict(seen.raw[0], seen.f[0])
+
+    def predicted(self, views: Sequence[View]) -> "PredictedViews":
+        """What the network predicts from views. Raises RunError if an output of the network is not finite."""
+        f = torch.tensor([view.camera.f for view in views], dtype=torch.float64)
+        raw = self.raw(np.stack([view.image for view in views]), f)
+        if not bool(raw.isfinite().all()):
+            bad = views[int(raw.flatten(1).isfinite().all(-1).long().argmin())]
+            raise RunError(f"{bad.where}: the network returns numbers that are not finite; train the run again")
+        return PredictedViews(self, views, raw, f)
+
+    def raw(
+        self, images: UInt8[np.ndarray, "batch S S 3"], f: Float[Tensor, " batch"]
+    ) -> Float[Tensor, "batch *members n_outputs"]:
+        """The raw numbers of the network, on the CPU; f in pixels of its images."""
+        return self.network.raw(torch.from_numpy(images), f)
+
+    def members(self, raw: Float[Tensor, "*batch members n"], f: Float[Tensor, "*batch"]) -> Mixture:
+        """The mixture of an ensemble's predictions from its raw numbers."""
+        return self.network.members(raw, f)
+
+    def predict(
+        self, raw: Float[Tensor, "*members n_outputs"], f: Float[Tensor, "*batch"], dtype: torch.dtype = torch.float64
+    ) -> Prediction:
+        """Predictions from the raw numbers of the network and focal lengths in pixels of its images.
+
+        Those of an ensemble have a dimension for the members before the last.
+        """
+        prediction = self.network.predict(raw, f, dtype)
+        if self.temperature is not None and prediction.has_closed_forms:
+            return self.temperature.apply(prediction)
+        return prediction
+
     def held_out(self) -> "Arrays":
         """The recorded predictions of held-out samples. Raises ConfigError or RunError if there are none."""
         self.require_densities("recalibrate= and coverage= need")
-        if len(self.folders) > 1 and self.views > 1:
-            raise RunError(
-                f"views={self.views}: held-out predictions of several views are recorded for single runs alone"
-            )
-        files = [folder.held_out if self.views == 1 else folder.eight_views["held_out"] for folder in self.folders]
+        views = self.network.views
+        if len(self.folders) > 1 and views > 1:
+            raise RunError(f"views={views}: held-out predictions of several views are recorded for single runs alone")
+        files = [folder.held_out if views == 1 else folder.eight_views["held_out"] for folder in self.folders]
         for file in files:
             if not file.exists():
                 remedy = "train with data.n_held_out > 0"
-                if self.views > 1 and self.config.data.n_held_out:
+                if views > 1 and self.config.data.n_held_out:
                     remedy = "repeat the command of the training with evaluation.eight_views=true, and `pack` again"
                 raise RunError(f"{file}: missing; held-out samples are needed: {remedy}")
         from phd_exp.evaluation.parquet import read_table  # imports pyarrow
@@ -179,7 +224,7 @@ class Predictor:
         there is no record, or one with another margin.
         """
         file = self.folders[0].labelled(name)
-        if self.is_ensemble:
+        if self.network.is_ensemble:
             raise RunError(f"calibration: got an ensemble with {file.parent.parent}; expected a single run")
         if not file.exists():
             known = sorted(path.stem for path in file.parent.glob("*.parquet"))
@@ -224,82 +269,6 @@ class Predictor:
         origin = "labelled images, every second of those of `calibrate`"
         return guarantee(read_table(self.labelled), coverage, groups, self.temperature, origin)
 
-    def view(
-        self, image: UInt8[np.ndarray, "height width 3"], K: Float[np.ndarray, "3 3"], box: Box | None = None
-    ) -> View:
-        """The network's input for a box (left, top, right, bottom, px; None: all) in an image of a camera K.
-
-        A box is viewed `margin` times as large, a small one with a focal length of `largest_f` pixels and the pixels
-        around it. Predictions are in the frame of `view.camera`; `view.camera.to_real` maps them back.
-
-        Raises DatasetError if the image is invalid or the box is outside the field of every pinhole camera.
-        """
-        (array,) = image_batch(image[None])
-        try:
-            camera = self.virtual_camera(K, (array.shape[1], array.shape[0]), box)
-        except ValueError as error:
-            raise DatasetError(f"image: {error}") from None
-        return View(cut(array, camera), camera)
-
-    def virtual_camera(
-        self, K: Float[np.ndarray, "3 3"], size: tuple[int, int], box: Box | None, lens: Lens = PINHOLE
-    ) -> VirtualCamera:
-        """The camera of the view of a box, see `view`, or of a whole image of that width and height (px).
-
-        Raises ValueError as `VirtualCamera.of_box`.
-        """
-        if box is None:
-            width, height = map(float, size)
-            return VirtualCamera.of_box(K, (0.0, 0.0, width, height), float(self.side), lens)
-        return VirtualCamera.of_box(K, enlarged(box, self.margin), float(self.side), lens, self.largest_f)
-
-    def see(self, views: View | Sequence[View]) -> Prediction:
-        """Predictions for views, each in the frame of its own virtual camera.
-
-        A single view gives a prediction without a batch dimension.
-
-        Warns (UserWarning) if the focal length of a view is beyond those of the training.
-        """
-        sequence = [views] if isinstance(views, View) else views
-        if faults := list(filter(None, (self.ranges.of_view(view.camera) for view in sequence))):
-            warn(f"{len(faults)} of {len(sequence)} views, first {faults[0]}", stacklevel=2)
-        f = torch.tensor([view.camera.f for view in sequence], dtype=torch.float32)
-        raw = self.raw(np.stack([view.image for view in sequence]), f)
-        return self.predict(raw, f) if sequence is views else self.predict(raw[0], f[0])
-
-    def raw(
-        self, images: UInt8[np.ndarray, "batch S S 3"], f: Float[Tensor, " batch"]
-    ) -> Float[Tensor, "batch *members n_outputs"]:
-        """The raw numbers of the network, on the CPU, at most 64 images at a time, fewer large ones; f in pixels of
-        its images.
-        """
-        known = self.camera(f.float().to(self.device)).f
-        n = max(1, min(BATCH, PIXELS // self.side**2) // self.views)
-        batches = zip(torch.from_numpy(images).split(n), known.split(n), strict=True)
-        return torch.cat([self.outputs(image.to(self.device), f).cpu() for image, f in batches])
-
-    def outputs(
-        self, image: UInt8[Tensor, "batch S S 3"], f: Float[Tensor, " batch"]
-    ) -> Float[Tensor, "batch *members n_outputs"]:
-        """The raw numbers of the network, or of all members of an ensemble, in the frame of each image."""
-        if not self.is_ensemble:
-            return self.regressor.raw(image, f)
-        signs = EIGHT[: self.views]
-        views = torch.stack([turned(image, sign) for sign in signs], dim=1).flatten(0, 1)
-        f = f.repeat_interleave(self.views)
-        raw = torch.stack([network.raw(views, f).unflatten(0, (-1, self.views)) for network in self.networks], dim=1)
-        head = self.regressor.head
-        assert isinstance(head, SymmetricHead)  # checked by `load`
-        return head.turned_back(raw, torch.tensor(signs).to(raw)).flatten(1, 2)
-
-    def members(
-        self, raw: Float[Tensor, "*batch members n"], f: Float[Tensor, "*batch"], dtype: torch.dtype = torch.float64
-    ) -> Mixture:
-        """The mixture of an ensemble's predictions from its raw numbers."""
-        prediction = self.regressor.head(raw.to(dtype), self.camera(f.to(dtype)[..., None]))
-        assert prediction.has_closed_forms  # checked by `load`
-        return Mixture(prediction)
-
     @cached_property
     def ranges(self) -> Ranges:
         """What the (first) network was trained with. Raises RunError if recorded held-out samples cannot be read."""
@@ -331,27 +300,45 @@ class Predictor:
         prediction = self.predict(raw, f) if prediction is None else prediction
         assert prediction.has_closed_forms  # only those have a familiarity
         columns = parameter_columns(prediction) | {"f": f.double(), "S": torch.full_like(f, self.side)}
-        if self.is_ensemble:
+        if self.network.is_ensemble:
             columns["disagreement"] = self.members(raw, f).disagreement
         distance = self.familiarity.distance({name: column.numpy() for name, column in columns.items()})
         return self.familiarity.p_value(distance)
 
-    def predict(
-        self, raw: Float[Tensor, "*batch n_outputs"], f: Float[Tensor, "*batch"], dtype: torch.dtype = torch.float64
-    ) -> Prediction:
-        """Predictions from the raw numbers of the network and focal lengths in pixels of its images.
 
-        Those of an ensemble have a dimension for the members before the last.
-        """
-        prediction: Prediction
-        if self.is_ensemble:
-            prediction = self.members(raw, f, dtype).closest
-        else:
-            prediction = self.regressor.head(raw.to(dtype), self.camera(f.to(dtype)))
-        if self.temperature is not None and prediction.has_closed_forms:
-            return self.temperature.apply(prediction)
-        return prediction
+@dataclass(frozen=True, eq=False)
+class PredictedViews:
+    """Views that were predicted together, as `Predictor.predicted` returns them.
 
-    def camera(self, f: Float[Tensor, "*batch"]) -> Camera:
-        """The camera as the network receives it."""
-        return Camera(f, float(self.side)).with_constant_f(self.constant_f)
+    Args:
+        predictor: of the predictions.
+        views: the input images.
+        raw: the outputs of the network.
+        f: focal lengths, px of the network's images.
+    """
+
+    predictor: Predictor
+    views: Sequence[View]
+    raw: Float[Tensor, "views *members n_outputs"]
+    f: Float[Tensor, " views"]
+
+    @cached_property
+    def predictions(self) -> Prediction:
+        """The predictions in float64, each in the frame of its view."""
+        return self.predictor.predict(self.raw, self.f)
+
+    @cached_property
+    def familiar(self) -> list[float] | None:
+        """Their p-values among held-out samples; None if unknown."""
+        found = self.predictor.familiar(self.raw, self.f, self.predictions)
+        return None if found is None else found.tolist()
+
+    @cached_property
+    def warnings(self) -> list[list[str]]:
+        """What is beyond the training in each view, see `Ranges.warnings`."""
+        familiar: Sequence[float | None] = self.familiar or [None] * len(self.views)
+        modes, ranges = self.predictions.mode.numpy(), self.predictor.ranges
+        return [
+            ranges.warnings(view.camera, mode, view.box, view.size, p_value)
+            for view, mode, p_value in zip(self.views, modes, familiar, strict=True)
+        ]

@@ -108,9 +108,9 @@ def _nanoseconds(where: str, time: float, origin: int = 0) -> int:
 
 def _located(sighting: Sighting) -> Located:
     """The mean and the covariance as they are predicted, in the frame of the real camera."""
-    numbers, row, line = sighting.batch.numbers, sighting.row, sighting.detection.line
+    numbers, line = sighting.numbers, sighting.detection.line
     name, score = "" if line.category_id is None else str(line.category_id), 1.0 if line.score is None else line.score
-    return Located(numbers["mean"][row], numbers["covariance"][row], name, score)
+    return Located(numbers["mean"], numbers["covariance"], name, score)
 
 
 def _photograph(sighting: Sighting) -> Photograph:

@@ -7,16 +7,27 @@ import numpy as np
 from jaxtyping import UInt8
 from torch import Tensor
 
-from phd_exp.optics.virtual import VirtualCamera
+from phd_exp.optics.virtual import Box, VirtualCamera
 from phd_exp.records.errors import DatasetError, shown
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """The input image of a network, prepared as in training, and its virtual camera, whose frame predictions have."""
+    """The input image of a network, prepared as in training, and its virtual camera, whose frame predictions have.
+
+    Args:
+        image: RGB.
+        camera: turned towards the box.
+        box: the part of the photograph that is predicted from, px.
+        size: width and height of the photograph, px.
+        where: the place of the photograph, for messages.
+    """
 
     image: UInt8[np.ndarray, "S S 3"]
     camera: VirtualCamera
+    box: Box
+    size: tuple[int, int]
+    where: str = "image"
 
 
 def image_batch(images: Any) -> UInt8[np.ndarray, "batch height width 3"]:

@@ -1,7 +1,7 @@
 """Predictions as columns, one row per sample, for logged metrics, calibration curves and the record."""
 
 import io
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import pyarrow as pa
@@ -19,7 +19,9 @@ from phd_exp.metrics.calibration import CalibrationCurve, calibration_curve
 from phd_exp.metrics.calibration_scores import exact_scores
 from phd_exp.metrics.errors import MILLIMETRES, depth_error, distance_error, projected_error
 from phd_exp.models.heads import Prediction
+from phd_exp.models.trained import BATCH, TrainedNetwork
 from phd_exp.records.files import write_atomic
+from phd_exp.training.cameras import f_factor
 
 MEANS = {
     "loss": "loss",
@@ -61,14 +63,14 @@ def _errors(prediction: Prediction, xyz: Tensor) -> Columns:
 
 
 @torch.no_grad()
-def columns(prediction: Prediction, batch: Batch, f_factor: Float[Tensor, " batch"] | float = 1.0) -> Columns:
+def columns(prediction: Prediction, batch: Batch, factor: Float[Tensor, " batch"] | float = 1.0) -> Columns:
     """A batch as a table: camera, truth, estimate, errors; of a distribution also parameters, moments and scores.
 
     Positions, `depth_crps` and `energy_score` are in metres, in the camera frame; see `distribution_columns`. `f` is
-    the focal length that the model received: `f_factor` times that of the batch.
+    the focal length that the model received: `factor` times that of the batch.
     """
-    table = {"row": batch.row, "f": f_factor * batch.f, "S": torch.full_like(batch.f, batch.S)}
-    table["f_factor"] = f_factor * torch.ones_like(batch.f)
+    table = {"row": batch.row, "f": factor * batch.f, "S": torch.full_like(batch.f, batch.S)}
+    table["f_factor"] = factor * torch.ones_like(batch.f)
     table |= coordinates("", batch.xyz) | coordinates("mode_", prediction.mode)
     table |= _errors(prediction, batch.xyz)
     table["ale_m"] = distance_error(batch.xyz, prediction.mode)
@@ -78,6 +80,35 @@ def columns(prediction: Prediction, batch: Batch, f_factor: Float[Tensor, " batc
         # seeded by the sample, so that the scores do not depend on the epoch
         table |= drawn_columns(prediction, batch.xyz, seed=int(batch.row[0]))
     return {name: column.double() for name, column in table.items()}
+
+
+def predicted(
+    network: TrainedNetwork,
+    samples: Batch,
+    f_error: float,
+    factor: float = 1.0,
+    change: Callable[[Tensor], Tensor] = lambda image: image,
+) -> Columns:
+    """The table of samples that a trained network predicts; of an ensemble also the `disagreement` of its members.
+
+    `change` is applied to the images, and the focal lengths have the errors of evaluations and a further factor.
+    """
+    parts = []
+    for rows in torch.arange(len(samples)).split(BATCH):
+        batch = samples.select(rows)
+        received = factor * f_factor(batch.row, f_error)
+        f = received * batch.f
+        raw = network.raw(change(batch.image), f)
+        found = columns(network.predict(raw, f), batch, received)
+        if network.is_ensemble:
+            found["disagreement"] = network.members(raw, f).disagreement
+        parts.append(found)
+    return joined(parts)
+
+
+def joined(parts: Sequence[Columns]) -> Columns:
+    """Tables one below the other."""
+    return {name: torch.cat([part[name] for part in parts]).cpu() for name in parts[0]}
 
 
 def calibration_curves(table: Columns, window: int) -> dict[str, CalibrationCurve]:

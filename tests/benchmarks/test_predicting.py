@@ -13,13 +13,13 @@ import torch
 from PIL import Image
 
 from phd_exp.hardware import one_thread
-from phd_exp.inference.answers import answer, sightings
+from phd_exp.inference.answers import sightings
 from phd_exp.inference.following import follow
-from phd_exp.inference.frames import video_frames
+from phd_exp.inference.frames import of_video
 from phd_exp.inference.loading import load
 from phd_exp.records.detections import detections_of
 from phd_exp.records.own_images import detections_in
-from phd_exp.records.videos import VideoWriter, shots_in
+from phd_exp.records.videos import VideoWriter
 from tests.support.untrained import untrained
 
 pytestmark = [pytest.mark.bench, pytest.mark.timeout(1800)]
@@ -57,7 +57,7 @@ def test_predictions_of_photographs_on_one_core(
     with one_thread():
         for _ in range(ROUNDS):
             start = time.process_time()
-            lines = [json.dumps(answer(one, predictor.temperature)) for one in sightings(predictor, detections)]
+            lines = [json.dumps(one.line) for one in sightings(predictor, detections)]
             seconds.append(time.process_time() - start)
     assert len(lines) == N
     speed = N / median(seconds)
@@ -88,7 +88,7 @@ def test_frames_of_a_video_on_one_core(
     with one_thread():
         for _ in range(ROUNDS):
             start = time.process_time()
-            followed = follow(predictor, video_frames(detection, boxes, shots_in(tmp_path / "clip.mp4")))
+            followed = follow(predictor, of_video(tmp_path / "clip.mp4", detection, boxes))
             lines = [json.dumps(one.answer(predictor)) for one in followed]
             seconds.append(time.process_time() - start)
     assert len(lines) == N

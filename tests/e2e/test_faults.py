@@ -1,8 +1,6 @@
 """What a machine refuses amid a training costs one line; later the same command ends as if nothing had happened."""
 
-import time
 from collections.abc import Callable, Iterator
-from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -88,17 +86,4 @@ def test_a_disk_that_fails_at_any_moment_is_one_line_and_nothing_is_lost(
         assert "results.json: No space left on device" in refused(train(*QUIET, f"runs={runs}"))
     make_room(disk)
     assert not only_run(runs).is_finished()
-    ends_as_unhindered(runs)
-
-
-@pytest.mark.slow
-def test_a_clock_that_jumps_changes_nothing(
-    train: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ends_as_unhindered: Callable
-) -> None:
-    """A year back with every look at it, as a machine without a battery may find."""
-    now, looks = time.time(), count()
-    runs = tmp_path / "runs"
-    with monkeypatch.context() as patch:
-        patch.setattr(time, "time", lambda: now - 365 * 86400 * next(looks))
-        assert train(*QUIET, f"runs={runs}").status == 0
     ends_as_unhindered(runs)

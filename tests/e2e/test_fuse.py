@@ -16,7 +16,7 @@ from phd_exp.geometry import intrinsics
 from phd_exp.records.runs import RunFolder
 from tests.e2e.conftest import QUICK
 from tests.support.several import write_views
-from tests.support.untrained import SMALL, read_lines, read_metadata, untrained, write_metadata
+from tests.support.untrained import read_lines, read_metadata, write_metadata
 
 VIEWS, SCENES = 3, 2
 
@@ -170,13 +170,6 @@ def test_a_shared_scale_is_estimated_with_the_spread_of_the_runs_own_scenes(
         assert shared["status"] == "fused"
         assert shared["shared_scale"] > 0
         assert shared["covariance"] != alone["covariance"]
-
-
-def test_a_baseline_is_refused(phd_exp: Callable, several: Path, composed: Callable, tmp_path: Path) -> None:
-    points = untrained(tmp_path / "points", composed(*SMALL, "model=mae_vz"))
-    refused = phd_exp("fuse", f"run={points.path}", f"folder={several}")
-    assert "predicts no Projected Huber densities" in refused.error
-    assert refused.out == ""
 
 
 def test_truths_that_contradict_the_poses_are_found_before_anything_is_predicted(

@@ -55,7 +55,7 @@ def test_pretrained_weights_are_loaded_once(own: Callable, tmp_path: Path) -> No
     assert own("backbone=pooled", "+backbone.pretrained=weights.pth", "optimizer.lr=1e-12").status == 0
     (tmp_path / "weights.pth").unlink()  # of the checkpoint from here on
     predictor = package.load(only_run(RUNS).path, trust=("ownnet",))
-    layer = dict(predictor.regressor.named_parameters())["backbone.network.layer.weight"]
+    layer = dict(predictor.network.named_parameters())["networks.0.backbone.network.layer.weight"]
     torch.testing.assert_close(layer, torch.full_like(layer, 0.5), rtol=0, atol=1e-6)
 
 
@@ -69,7 +69,7 @@ def test_a_network_of_timm_trains_and_needs_its_file_once(own: Callable, tmp_pat
     assert outcome.status == 0, outcome.err
     (tmp_path / "tiny.pth").unlink()
     run = only_run(RUNS)
-    network = package.load(run.path).regressor.backbone.network.network
+    network = package.load(run.path).network.networks[0].backbone.network.network
     torch.testing.assert_close(network.bn1.weight.cpu(), theirs["bn1.weight"])
     assert not torch.equal(network.layer2[0].conv1.weight.cpu(), theirs["layer2.0.conv1.weight"])
     assert own(*words, f"init={run.path}", "runs=further").status == 0
@@ -83,25 +83,18 @@ def test_a_network_of_timm_trains_and_needs_its_file_once(own: Callable, tmp_pat
         (["backbone._target_=ownnet.NaN"], "backbone: returned features that are not finite for a black image ("),
         (["backbone._target_=ownnet.NoModule"], "backbone: ownnet.NoModule makes a NoModule; expected a"),
         (["backbone._target_=broken.X"], "cannot be imported (ModuleNotFoundError: No module named 'nothing_here' ("),
-        (["backbone._target_=nowhere.X"], "'nowhere.X' cannot be imported (No module named 'nowhere')"),
         (["+backbone.depth=3"], "backbone.depth: unknown key, did you mean 'width'?; ownnet.Mine takes width"),
         (["loss._target_=ownloss.wrong_shape"], "loss: returned (2, 3) for 2 images; expected (2,) or () ("),
         (["model.head._target_=ownnet.Mine"], "model.head._target_: 'ownnet.Mine' is no head; see conf/model"),
-        (["data.source._target_=ownnet.NoModule"], "data.source: "),
         (["+callbacks.mine._target_=ownnet.Mine"], "callbacks.mine: makes a Mine; expected a lightning.Callback ("),
-        (["+callbacks.mine=3"], "callbacks.mine: got 3; expected a node with a _target_"),
         (["+logger.mine._target_=ownnet.Mine"], "logger.mine: makes a Mine; expected a Logger of Lightning ("),
         (["callbacks=early_stopping", "callbacks.early_stopping.monitor=test/loss"], "test samples choose nothing"),
-        (["callbacks=early_stopping", "data.n_held_out=0"], "data.n_held_out > 0"),
         (["callbacks=best_checkpoint", "+callbacks.best_checkpoint.dirpath=."], "got '.'; expected null"),
         (["callbacks=early_stopping", "callbacks.early_stopping.monitor=held_out/los"], "mean 'held_out/loss'?"),
-        (["callbacks=best_checkpoint", "callbacks.best_checkpoint.monitor=loss"], "loss: not logged"),
-        (["callbacks=lr_monitor"], "Cannot use `LearningRateMonitor` callback with `Trainer` that has no logger"),
         (["+trainer.fast_dev_run=true"], "trainer.fast_dev_run: the run record depends on it; instead set trainer"),
         (["+trainer.limit_train_batches=0"], "trained no whole epoch, so there is no run"),
         (["backbone=pooled", "+backbone.pretrained=no.pth"], "backbone: pretrained: got 'no.pth'; expected a file"),
         (["backbone=located", "backbone.network._target_=ownnet.Mine"], "expected feature maps (2, n, rows,"),
-        (["+trainer.callbacks=[]"], "trainer.callbacks: the run record depends on it; instead set callbacks=NAME"),
         (["+trainer.gradient_clip=1"], "trainer.gradient_clip: unknown key, did you mean 'gradient_clip_val'?"),
     ],
     ids=str,

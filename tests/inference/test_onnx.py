@@ -15,6 +15,8 @@ from phd_exp.geometry import Camera, Cartesian, Chart, DepthScale, LogDepth, Pro
 from phd_exp.inference.deployed import OfPhotographs, answers, require_exportable
 from phd_exp.inference.predictor import Predictor
 from phd_exp.models.heads import ChartHead, DistributionHead, Head, MixtureHead, SurrogateHead
+from phd_exp.models.regressor import Regressor
+from phd_exp.models.trained import TrainedNetwork
 from phd_exp.records.errors import ConfigError
 from tests.support.densities import BASELINES, SHAPED, predicted, raw_numbers
 from tests.support.portable import NoChoiceOfTruths, openvino_outputs, require_portable
@@ -30,19 +32,19 @@ SIDE = 32
 DEPTH = DepthScale.from_ranges(f_range=(600.0, 1000.0), z_range=(3.0, 5.0))
 
 
-class Table(nn.Module):
+class Table(Regressor):
     """Stands in for a regressor: the first three bytes of an image number a row of outputs, modulo their number."""
 
-    numbers: Tensor
+    rows: Tensor
 
     def __init__(self, head: Head, numbers: Tensor) -> None:
-        super().__init__()
+        nn.Module.__init__(self)
         self.head = head
-        self.register_buffer("numbers", numbers[:, : head.n_outputs].float())
+        self.register_buffer("rows", numbers[:, : head.n_outputs].float())
 
     def raw(self, image: Tensor, f: Tensor | None = None) -> Tensor:
         row = (image[:, 0, 0].long() * torch.tensor([1, 256, 65536])).sum(-1)
-        return self.numbers[row % len(self.numbers)]
+        return self.rows[row % len(self.rows)]
 
 
 def images_of(rows: np.ndarray) -> np.ndarray:
@@ -58,17 +60,17 @@ def draws(n: int, extreme: int) -> Tensor:
     return torch.cat([raw_numbers("free_axis", n, generator), hostile(extreme, generator)])
 
 
-def predictor(composed: Callable[..., Any], head: Head, numbers: Tensor, **changes: Any) -> Predictor:
-    kept: dict[str, Any] = {"constant_f": None, "temperature": None} | changes
-    return Predictor(
-        config=check(composed("preset=smoke")),
-        regressor=Table(head, numbers),  # type: ignore[arg-type]
-        side=SIDE,
-        depth=DEPTH,
-        device=torch.device("cpu"),
-        state="finished",
-        **kept,
-    )
+def predictor(
+    composed: Callable[..., Any],
+    head: Head,
+    *numbers: Tensor,
+    constant_f: float | None = None,
+    views: int = 1,
+    **changes: Any,
+) -> Predictor:
+    """Of a network for each table of numbers."""
+    network = TrainedNetwork([Table(head, one) for one in numbers], SIDE, constant_f, views)
+    return Predictor(check(composed("preset=smoke")), network, DEPTH, "finished", (), **changes)
 
 
 def exported(made: Predictor, kind: str = "OfImages", precision: str = "float32") -> Any:
@@ -148,36 +150,6 @@ def test_float32_has_the_digits_of_float64_in_the_modes_of_other_densities(name:
 TEMPERATURE = Temperature(1.3, 0.7, Slope(0.1, 3.0, 8.0), Slope(-0.2, 2.0, 6.0))
 
 
-@pytest.mark.slow
-def test_the_distribution_is_that_of_torch_in_every_runtime(composed: Callable[..., Any]) -> None:
-    numbers = draws(10_000, 2_000)
-    made = predictor(composed, DistributionHead(DEPTH, free_axis=True), numbers, temperature=TEMPERATURE)
-    images, f = images_of(np.arange(len(numbers))), np.linspace(2, 9, len(numbers), dtype=np.float32) * SIDE
-    model = exported(made)
-    require_portable(model)
-    session = session_of(model)
-    found = worst(made, session, images, f)
-    assert found.keys() == {"mode", "mean", "covariance", "a", "median_depth", "depth_interval"}
-    require_accurate(found)
-    given = {"image": images, "f": f}
-    other = openvino_outputs(model.SerializeToString(), given)
-    np.testing.assert_array_equal(other[0], session.run(["raw"], given)[0])
-    there = answers(made.predict(made.raw(images, torch.from_numpy(f)), torch.from_numpy(f))).values()
-    require_accurate(dict(zip(found, deviations(other[1:], [value.numpy() for value in there]), strict=True)))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("precision", ["float32", "float64"])
-def test_a_rounded_mode_is_that_of_torch(composed: Callable[..., Any], precision: str) -> None:
-    numbers = raw_numbers("rounded_t", 1_000, torch.Generator().manual_seed(0))
-    made = predictor(composed, HEADS["rounded"], numbers, temperature=TEMPERATURE)
-    images, f = images_of(np.arange(len(numbers))), np.linspace(2, 9, len(numbers), dtype=np.float32) * SIDE
-    model = exported(made, precision=precision)
-    if precision == "float32":
-        require_portable(model)
-    require_accurate(worst(made, session_of(model), images, f))
-
-
 def disagreeing(raw: Tensor, widths: float, members: int) -> Tensor:
     """Raw numbers of members whose modes differ by about so many widths of their densities, a at least 0.4."""
     noise = torch.randn((len(raw), members, 9), generator=torch.Generator().manual_seed(0), dtype=raw.dtype)
@@ -205,20 +177,40 @@ def test_float32_has_the_digits_of_float64_in_ensembles(widths: float, n_outputs
         assert np.quantile(deviation, 0.99) < tolerance * (10 if name == "a" else 1), name
 
 
+def made(composed: Callable[..., Any], name: str) -> Predictor:
+    """The ensemble has two networks with eight views each."""
+    if name == "ensemble":
+        raw = torch.tensor([[0.0, 0, 90, 15, 120, 60, 4, 1.2, -0.5]]).expand(100, 9)
+        return predictor(composed, HEADS["free"], *disagreeing(raw, 1.0, 2).unbind(1), views=8)
+    generator = torch.Generator().manual_seed(0)
+    numbers = draws(10_000, 2_000) if name == "free" else raw_numbers("rounded_t", 1_000, generator)
+    return predictor(composed, HEADS[name], numbers, temperature=TEMPERATURE)
+
+
 @pytest.mark.slow
-def test_an_ensemble_is_that_of_torch_in_every_runtime(composed: Callable[..., Any]) -> None:
-    """Two networks with eight views each."""
-    head = DistributionHead(DEPTH, free_axis=True)
-    numbers = disagreeing(torch.tensor([[0.0, 0, 90, 15, 120, 60, 4, 1.2, -0.5]]).expand(100, 9), 1.0, 2)
-    made = predictor(composed, head, numbers[:, 0], others=(Table(head, numbers[:, 1]),), views=8)
-    images, f = images_of(np.arange(100)), np.linspace(2, 9, 100, dtype=np.float32) * SIDE
-    model = exported(made)
-    require_portable(model)
-    found = worst(made, session_of(model), images, f)
+@pytest.mark.parametrize(
+    ("name", "precision"),
+    [("free", "float32"), ("rounded", "float32"), ("rounded", "float64"), ("ensemble", "float32")],
+)
+def test_a_graph_gives_the_answers_of_torch_in_every_runtime(
+    composed: Callable[..., Any], name: str, precision: str
+) -> None:
+    one = made(composed, name)
+    n = len(one.network.networks[0].rows)  # type: ignore[attr-defined]
+    images, f = images_of(np.arange(n)), np.linspace(2, 9, n, dtype=np.float32) * SIDE
+    model = exported(one, precision=precision)
+    session = session_of(model)
+    found = worst(one, session, images, f)
+    assert found.keys() == {"mode", "mean", "covariance", "a", "median_depth", "depth_interval"}
     require_accurate(found)
+    if precision == "float32":
+        require_portable(model)
+    if name == "rounded":
+        return
     other = openvino_outputs(model.SerializeToString(), {"image": images, "f": f})
-    raw, known = made.raw(images, torch.from_numpy(f)).double(), torch.from_numpy(f).double()
-    there = [value.numpy() for value in answers(made.predict(raw, known)).values()]
+    np.testing.assert_array_equal(other[0], session.run(["raw"], {"image": images, "f": f})[0])
+    raw, known = one.raw(images, torch.from_numpy(f)).double(), torch.from_numpy(f).double()
+    there = [value.numpy() for value in answers(one.predict(raw, known)).values()]
     require_accurate(dict(zip(found, deviations(other[1:], there), strict=True)))
 
 

@@ -4,7 +4,6 @@ Archives of an attacker are in tests/bad_input/table.py.
 """
 
 import gc
-import io
 import json
 import re
 import shutil
@@ -19,7 +18,7 @@ import pytest
 import torch
 
 import phd_exp as package
-from phd_exp.records.packed import NAMES, opened
+from phd_exp.records.packed import NAMES
 from phd_exp.records.runs import RunFolder
 from tests.evaluation.test_conformal import table_of
 from tests.support.recorded import status_of
@@ -144,14 +143,3 @@ def test_what_cannot_be_packed_or_recorded(phd_exp: Callable, run: RunFolder, ph
     status_of(run, state="interrupted")
     assert phd_exp("pack", f"run={run.path}").error == f"{run.path}: expected the folder of a finished run"
     assert phd_exp("pack", "run=nowhere").error == "nowhere: expected the folder of a finished run"
-
-
-def test_an_archive_can_be_packed_again_by_hand(phd_exp: Callable, run: RunFolder, tmp_path: Path) -> None:
-    """As ordinary programmes do, if they do not compress."""
-    assert phd_exp("pack", f"run={run.path}").status == 0
-    stream = io.BytesIO()
-    with ZipFile(run.path / "run.zip") as one, ZipFile(stream, "w") as other:
-        for name in reversed(one.namelist()):
-            other.writestr(name, one.read(name))
-    (tmp_path / "again.zip").write_bytes(stream.getvalue())
-    assert opened(tmp_path / "again.zip").results() == json.loads(run.results_file.read_text())

@@ -16,20 +16,25 @@ import torch
 from PIL import Image
 
 import phd_exp as package
-from phd_exp.data.crops import cut, facing
 from phd_exp.distributions import ProjectedHuber
 from phd_exp.geometry import Lens, VirtualCamera, intrinsics
 from phd_exp.inference import pictures
-from phd_exp.inference.answers import PredictedBatch, Sighting, answer
-from phd_exp.inference.views import View
+from phd_exp.inference.answers import Answers, Sighting
+from phd_exp.inference.predictor import PredictedViews
 from phd_exp.records.detections import detections_of
 from phd_exp.records.errors import DatasetError, RunError
-from phd_exp.records.own_images import detections_in
 from phd_exp.records.runs import RunFolder
 from tests.evaluation.test_conformal import table_of
-from tests.support.foreign import WRITERS
 from tests.support.recorded import status_of
-from tests.support.untrained import NOWHERE, SIDE, read_lines, virtual_cameras, write_metadata, write_photos
+from tests.support.untrained import (
+    NOWHERE,
+    SIDE,
+    read_lines,
+    read_metadata,
+    virtual_cameras,
+    write_metadata,
+    write_photos,
+)
 
 
 @pytest.fixture(scope="module")
@@ -124,21 +129,33 @@ def test_a_baseline_has_positions_without_uncertainty(
         image = np.asarray(Image.open(photos / row["file_name"]))
         prediction = predictor.see(predictor.view(image, camera.K, row["box"]))
         np.testing.assert_allclose(row["position"], camera.to_real(prediction.mode.numpy()), rtol=1e-5, atol=1e-5)
-    for word, said in (("recalibrate", "no Projected Huber densities"), ("curve", "no calibration curve")):
-        refused = phd_exp("predict", f"run={baseline.path}", f"folder={photos}", f"{word}=true", "out=more")
-        assert said in refused.error
 
 
-@pytest.mark.parametrize("name", WRITERS)
-def test_other_formats_are_predicted_as_lines(phd_exp: Callable, run: RunFolder, tmp_path: Path, name: str) -> None:
-    """The same answers as for a metadata.jsonl that says the same."""
-    folder = WRITERS[name](tmp_path / "test")
-    words = ("predict", f"run={run.path}", f"folder={folder}")
-    found = phd_exp(*words)
-    assert (found.status, found.err) == (0, "")
-    lines = [detection.line.model_dump_json(exclude_none=True) for detection in detections_in(folder)]
-    (folder / "metadata.jsonl").write_text("\n".join(lines))
-    assert found.out == phd_exp(*words).out
+@pytest.mark.parametrize(
+    "words",
+    [
+        "predict recalibrate=true",
+        "predict coverage=0.9",
+        "predict view=new.rrd",
+        "predict out=new.mcap",
+        "track out=new",
+        "fuse out=new.jsonl",
+        "calibrate name=new",
+    ],
+)
+def test_what_needs_densities_refuses_a_baseline(
+    phd_exp: Callable, baseline: RunFolder, photos: Path, tmp_path: Path, words: str
+) -> None:
+    verb, word = words.split()
+    pose = {"scene": 0, "pose": {"rotation": [1, 0, 0, 0], "translation": [0, 0, 0]}}
+    (tmp_path / "photos").mkdir()
+    for line in read_metadata(photos):
+        shutil.copy(photos / line["file_name"], tmp_path / "photos")
+    lines = [line | pose | {"time": number} for number, line in enumerate(read_metadata(photos))]
+    write_metadata(tmp_path / "photos", [{k: v for k, v in one.items() if k not in "xyz"} for one in lines])
+    refused = phd_exp(verb, f"run={baseline.path}", "folder=photos", word)
+    assert "predicts no Projected Huber densities" in refused.error
+    assert refused.out == ""
 
 
 def test_boxes_of_one_photograph_are_predicted_as_single_ones(
@@ -198,28 +215,6 @@ def test_images_of_one_camera_are_predicted_as_single_ones(phd_exp: Callable, ru
     assert [row["file_name"] for row in read_lines(outcome.out)] == ["in/a.png", "more/b.JPG"]
 
 
-def test_one_image_is_the_line_of_a_folder_and_is_drawn(
-    phd_exp: Callable, run: RunFolder, photos: Path, tmp_path: Path
-) -> None:
-    camera = ("fx=300", "fy=310", "cx=50", "cy=40", "box=5,10,60,70")
-    image = f"image={photos / '0.png'}"
-    outcome = phd_exp("predict", f"run={run.path}", image, *camera, "out=drawn")
-    assert (outcome.status, outcome.out) == (0, "")
-    (row,) = read_lines((tmp_path / "drawn" / "predictions.jsonl").read_text())
-    there = read_lines(phd_exp("predict", f"run={run.path}", f"folder={photos}").out)[0]
-    assert row.keys() - {"picture"} <= there.keys()
-    for key in ("mode", "covariance", "median_depth"):
-        np.testing.assert_allclose(row[key], there[key], rtol=1e-5, atol=1e-6)
-    with Image.open(tmp_path / "drawn" / row["picture"]) as picture:
-        assert picture.format == "PNG"
-        assert picture.width > 2 * picture.height * 0.9
-    before = (photos / "0.png").read_bytes()
-    lost = phd_exp("predict", f"run={run.path}", image, *camera, f"out={photos}")
-    assert lost.status == 2
-    assert "holds the images themselves" in lost.err
-    assert (photos / "0.png").read_bytes() == before
-
-
 def test_every_line_has_its_own_picture(
     phd_exp: Callable, run: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -243,6 +238,8 @@ def test_every_line_has_its_own_picture(
     assert [row["file_name"] for row in rows] == names
     files = {row["picture"] for row in rows}
     assert len(files) == len(names)
+    refused = phd_exp("predict", f"run={run.path}", "folder=in", "out=in")
+    assert (refused.status, "holds the images themselves" in refused.error) == (2, True)
     assert files == {file.name for file in (tmp_path / "drawn").glob("*.png")}
     first, second = titles[0].split("\n")
     assert first == "a.png, f = 400.5 px"
@@ -255,18 +252,18 @@ def test_every_line_has_its_own_picture(
 
 @pytest.mark.parametrize(("precision", "panels"), [(1000.0, 3), (10.0, 2)])
 def test_small_curves_have_a_close_up_and_the_box_a_frame(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, precision: float, panels: int
+    run: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, precision: float, panels: int
 ) -> None:
     monkeypatch.setattr(pictures, "encoded", lambda figure, *_, **how: figure)
     (detection,) = detections_of([tmp_path / "a.png"], {"f": 900.0}, [{"box": [200, 150, 440, 330]}])
-    image = Image.new("RGB", (640, 480))
-    camera = facing(detection, image.size, SIDE)
+    image, predictor = Image.new("RGB", (640, 480)), package.load(run.path)
+    view = predictor.view(image, *detection.optics(*image.size)[:1], detection.box(*image.size))
     eye = torch.eye(2, dtype=torch.float64)
     prediction = ProjectedHuber(0 * eye[:1], 4 * eye[0, :1], precision * eye[None], 50 * eye[0, :1])
-    view = View(cut(image, camera), camera)
-    seen = detection, image, view
-    sighting = Sighting(*seen, PredictedBatch([seen], torch.zeros(1, 7), prediction), 0)
-    line = answer(sighting, None)
+    seen = PredictedViews(predictor, [view], torch.zeros(1, 7), torch.tensor([view.camera.f]).double())
+    vars(seen)["predictions"] = prediction
+    sighting = Sighting(detection, image, Answers([detection], seen), 0)
+    line = sighting.line
     figure: Any = pictures.picture(sighting, line)
     first, second, *_ = axes = figure.axes
     assert len(axes) == panels
@@ -308,8 +305,9 @@ def test_answers_and_curves_go_through_the_lens(
     (row,) = read_lines((tmp_path / "drawn" / "predictions.jsonl").read_text())
     K, lens = intrinsics(300.0, 310.0, 50.0, 40.0), Lens((-0.9, 0.4, 0.01, -0.02))
     camera = VirtualCamera.of_box(K, (5.0, 10.0, 60.0, 70.0), float(SIDE), lens)
+    predictor = package.load(run.path)
     with Image.open(photos / "0.png") as image:
-        prediction = package.load(run.path).see(View(cut(image.convert("RGB"), camera), camera))
+        prediction = predictor.see(predictor.view(image.convert("RGB"), K, (5.0, 10.0, 60.0, 70.0), lens))
     np.testing.assert_allclose(row["mode"], camera.to_real(prediction.mode.numpy()), rtol=1e-4, atol=1e-5)
     R, covariance = camera.R, prediction.covariance_matrix.numpy()
     np.testing.assert_allclose(row["covariance"], R.T @ covariance @ R, rtol=1e-3, atol=1e-5)
@@ -362,24 +360,12 @@ def test_an_unfinished_run_is_used_with_a_notice(phd_exp: Callable, spoiled: Run
 
 
 LOADS = "phd_exp.load(sys.argv[1])\nassert not {'lightning', 'matplotlib', 'pyarrow', 'bpy'} & set(sys.modules)"
-SLOW_TO_IMPORT = {
-    "lightning",
-    "hydra",
-    "omegaconf",
-    "wandb",
-    "pandas",
-    "torchvision",
-    "torchmetrics",
-    "numba",
-    "rich",
-    "scipy.optimize",
-    "scipy.spatial",
-    "scipy.stats",
-    "sympy",
-    "torch._dynamo",
-    "torch._inductor",
-    "matplotlib",
-}
+
+
+SLOW_TO_IMPORT = (
+    "lightning hydra omegaconf wandb pandas torchvision torchmetrics numba rich scipy.optimize scipy.spatial "
+    "scipy.stats sympy torch._dynamo torch._inductor matplotlib"
+)
 
 
 @pytest.mark.parametrize("then", ["", pytest.param(LOADS, marks=pytest.mark.slow)], ids=["import", "load"])
@@ -397,7 +383,7 @@ def test_a_prediction_imports_nothing_that_it_does_not_need(make: Callable[..., 
     code = (
         "import sys; from phd_exp.__main__ import main\n"
         "assert main(sys.argv[1:]) == 0\n"
-        f"found = {SLOW_TO_IMPORT} & set(sys.modules); assert not found, found"
+        f"found = set({SLOW_TO_IMPORT!r}.split()) & set(sys.modules); assert not found, found"
     )
     words = ["predict", f"run={run.path}", f"image={photos / '0.png'}", "f=800"]
     done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True)

@@ -159,25 +159,16 @@ def test_a_path_has_its_times(phd_exp: Callable, run: str, tmp_path: Path) -> No
         require_around(curve, np.concatenate([curve, seen(rows, time, "/ball/camera", np.array([answer["mean"]]))]))
 
 
-def test_a_recording_is_new_and_of_a_density(
-    phd_exp: Callable, run: str, make: Callable[..., RunFolder], tmp_path: Path
-) -> None:
+def test_a_recording_is_new_and_whole_before_a_bad_image(phd_exp: Callable, run: str, tmp_path: Path) -> None:
     write_photos(tmp_path / "photos", 2)
     (tmp_path / "a.rrd").write_text("earlier")
-    baseline = f"run={make(*NOWHERE, 'model=mae_constf').path}"
-    for words, status, said in (
-        ((run, "view=a.rrd"), 2, "view=a.rrd: holds other data than this command writes; expected a new file, .*"),
-        ((run, "view=photos"), 2, "view: got photos; expected a file *.rrd, such as view.rrd"),
-        ((run, "view=/proc/no/a.rrd"), 2, "/proc/no: cannot be written (No such file or directory); make room, .*"),
-        ((baseline, "view=b.rrd"), 2, "view: .* predicts no Projected Huber densities, .*"),
+    for word, said in (
+        ("view=a.rrd", "view=a.rrd: holds other data than this command writes; expected a new file, "),
+        ("view=photos", "view: got photos; expected a file *.rrd, such as view.rrd"),
     ):
-        outcome = phd_exp("predict", "folder=photos", *words)
-        assert outcome.status == status
-        (line,) = outcome.err.splitlines()
-        assert line.startswith("error: ")
-        assert said.removesuffix(".*").partition(".*")[2] in line
+        outcome = phd_exp("predict", run, "folder=photos", word)
+        assert (outcome.status, said in outcome.error) == (2, True)
     assert (tmp_path / "a.rrd").read_text() == "earlier"
-    assert not (tmp_path / "b.rrd").exists()
     (tmp_path / "photos/1.png").write_bytes(b"no image")
     assert phd_exp("predict", "folder=photos", run, "view=c.rrd").status == 1
     assert sorted(read_rrd(tmp_path / "c.rrd", "image")["/camera"]["t"]) == [0]

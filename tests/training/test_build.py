@@ -20,9 +20,9 @@ from phd_exp.data.batches import Batch, BatchLoader, Exchange
 from phd_exp.data.images import SHRINKING
 from phd_exp.data.photometry import VERSION
 from phd_exp.data.prints import PRINT_NUMBERS, printed
-from phd_exp.inference import tables
 from phd_exp.records.errors import ConfigError, RunError
 from phd_exp.records.runs import RunFolder
+from phd_exp.training import tables
 from phd_exp.training.build import build_data, build_module
 from phd_exp.training.objective import factor
 from phd_exp.training.recorder import has_curves

@@ -17,10 +17,9 @@ from phd_exp.config import RunConfig, check
 from phd_exp.data.batches import Batch
 from phd_exp.data.sources import Part, Source
 from phd_exp.evaluation.parquet import read_table
-from phd_exp.inference import tables
-from phd_exp.inference.further import record_further
 from phd_exp.records.errors import RunError
 from phd_exp.records.runs import RunFolder
+from phd_exp.training import tables
 from phd_exp.training.build import build_data, build_module
 from phd_exp.training.cameras import standard_error
 from phd_exp.training.predictions import write_parquet
@@ -66,9 +65,9 @@ def run(run_in: Callable, tmp_path_factory: pytest.TempPathFactory) -> RunFolder
     def make(path: Path) -> None:
         run = run_in(path, *WORDS)
         config = check(run.config())
-        record_further(run, config, partial(rendered, cores=1))
+        tables.record_tables(run, config, partial(rendered, cores=1))
         source = build_source(config.data)
-        tables.record(run, run.views, source, tables.origin_of(run, config))
+        tables.record(run, config, run.views, source, tables.origin_of(run, config))
 
     return RunFolder(once(tmp_path_factory, "run with wrong focal lengths", make))
 

@@ -13,8 +13,8 @@ import phd_exp as package
 from phd_exp.build import build_source
 from phd_exp.config import check
 from phd_exp.evaluation.parquet import read_table
-from phd_exp.inference import tables
 from phd_exp.records.runs import RunFolder
+from phd_exp.training import tables
 from tests.support.recorded import once, status_of
 
 PREDICT = ("predict", "run=run", "views=8", "coverage=0.5", "image=photo.png", "f=500")
