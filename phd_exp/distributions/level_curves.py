@@ -27,7 +27,7 @@ Values = Float[np.ndarray, "radii rays"]
 
 LEVELS = (0.5, 0.9, 0.99)
 _RAYS = 37  # of half a plane
-_REACH, _RADII, _CELLS = 10.0, 193, 2501  # of asinh(50 radius): radii up to 220 deviations, interpolated
+_REACH, _RADII, _CELLS = 10.0, 193, 1201  # of asinh(50 radius): radii up to 220 deviations, interpolated
 _FURTHEST_ENERGY = 25.0  # of depth; beyond, no probability is left
 _LEAST = -1e4  # log densities that are lower count as this
 
