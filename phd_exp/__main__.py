@@ -42,6 +42,8 @@ def _run(words: list[str]) -> int:
     if HELP & set(words) or "--version" in words:
         print(text_of(verb) if HELP & set(words) else f"phd_exp {__version__}")
         return 0
+    if verb == "report":  # small arrays: several threads of BLAS, which NumPy starts at its import, would wait
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from phd_exp.cli.frame import run_verb
 
     if os.getcwd() not in sys.path:
