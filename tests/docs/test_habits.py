@@ -51,3 +51,20 @@ def test_changelog_and_citation_have_the_version() -> None:
 
 def _names(layer: Any) -> set[str]:
     return {name.strip() for name in layer.split("|")}
+
+
+def test_every_folder_keeps_its_budget() -> None:
+    table = CONTRIBUTING.partition("## Budgets")[2].partition("## ")[0]
+    rows = re.findall(r"^\| ([a-z, ]+) \| ([\d,]+) \| [\d,]+ \|$", table, re.MULTILINE)
+    limits = {names: int(limit.replace(",", "")) for names, limit in rows}
+    rooms = {room for names in limits for room in names.split(", ")}
+    assert rooms == {file.parent.name for file in (ROOT / "phd_exp").glob("*/__init__.py")} | {"top", "tests"}
+    for names, limit in limits.items():
+        lines = sum(map(_lines, names.split(", ")))
+        assert lines <= limit, f"{names}: {lines} lines; the budget in CONTRIBUTING.md is {limit}"
+
+
+def _lines(room: str) -> int:
+    folder = ROOT / room if room == "tests" else ROOT / "phd_exp" / room
+    files = (ROOT / "phd_exp").glob("*.py") if room == "top" else folder.rglob("*.py")
+    return sum(len(file.read_text().splitlines()) for file in files)
