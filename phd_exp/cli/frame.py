@@ -10,7 +10,16 @@ from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import NamedTuple
 
-from phd_exp.records.errors import CONTROLS, ConfigError, RunError, UserError, in_user_code, install, one_line
+from phd_exp.records.errors import (
+    CONTROLS,
+    ConfigError,
+    RenderError,
+    RunError,
+    UserError,
+    in_user_code,
+    install,
+    one_line,
+)
 from phd_exp.records.processes import announce
 
 RESUMES = "the same command resumes"
@@ -50,7 +59,7 @@ def failure(error: BaseException) -> Ending:
     if isinstance(error, Stopped):
         return Ending("interrupted", (f"stopped by {error}; {RESUMES}",), 128 + error.signum)
     if isinstance(error, UserError):
-        several = isinstance(error, ConfigError | RunError)  # of other errors, a line break is a stranger's
+        several = isinstance(error, ConfigError | RunError | RenderError)  # in others, a line break is a stranger's
         lines = tuple(str(error).splitlines()) if several else (str(error),)
         return Ending("failed", lines, 2 if isinstance(error, ConfigError) else 1)
     if isinstance(error, ModuleNotFoundError) and (remedy := install(error.name or "")):

@@ -11,7 +11,7 @@ import numpy as np
 from PIL import Image
 
 from phd_exp.records.dataset import SPLITS, DatasetFolder, Seal
-from phd_exp.records.errors import DatasetError, RenderError, UserError
+from phd_exp.records.errors import DatasetError, RenderError, UserError, one_line
 from phd_exp.records.files import checksum
 from phd_exp.records.images import recorded_image
 from phd_exp.records.processes import announce
@@ -35,7 +35,8 @@ def verify(folder: DatasetFolder, spec: DatasetSpec, rerender: int, seed: int | 
     the rounding errors of another processor.
 
     Raises:
-        DatasetError: one line for each fault, with its remedy; or the folder holds no such data set.
+        RenderError: one line for each fault, with its remedy.
+        DatasetError: the folder holds no such data set.
         RenderError: samples are to be rendered again, and bpy is missing.
     """
     manifest = folder.require(spec)
@@ -62,7 +63,7 @@ def verify(folder: DatasetFolder, spec: DatasetSpec, rerender: int, seed: int | 
             advance()
     wrong += _rendered_again(folder, spec, random.Random(seed).sample(sound, min(rerender, len(sound))))
     if wrong:
-        raise DatasetError("\n".join(wrong))
+        raise RenderError("\n".join(map(one_line, wrong)))
     return len(sound)
 
 

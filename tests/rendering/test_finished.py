@@ -28,7 +28,7 @@ def copy(small: DatasetFolder, tmp_path: Path) -> DatasetFolder:
 
 
 def complaints(folder: DatasetFolder, spec: DatasetSpec, rerender: int = 0) -> list[str]:
-    with pytest.raises(DatasetError) as error:
+    with pytest.raises(RenderError) as error:
         verify(folder, spec, rerender, seed=0)
     return str(error.value).splitlines()
 
