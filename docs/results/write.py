@@ -151,8 +151,7 @@ def readme(cells: pd.DataFrame, scores: pd.DataFrame) -> str:
     }.items():
         table += row(label, [both_errors(cells, data=data, reading=reading, **choice) for data in DATA])
     kept = chosen(scores, preset=PRESET, model="probabilistic", predictions="as trained", quantity="inside_90")
-    kept = kept[kept["run"].str.fullmatch(r"seed\d+")]
-    shares = [chosen(kept, data=data)["value"].astype(float).mean() for data in DATA]
+    shares = [chosen(of_seeds(kept), data=data)["value"].astype(float).mean() for data in DATA]
     return table + line("inside the 90 % region, whole field", *(f"{share:.1f} %" for share in shares))
 
 
@@ -222,15 +221,24 @@ def calibration(scores: pd.DataFrame) -> str:
     for data in DATA:
         for kind in ("as trained", "recalibrated"):
             found = chosen(scores, preset=PRESET, data=data, model="probabilistic", predictions=kind)
-            found = found[found["run"].str.fullmatch(r"seed\d+")]
-            cells = [NOTHING if found.empty else score(found, name, digits) for name, (_, digits) in columns.items()]
+            found = of_seeds(found)
+            cells = [score(found, name, digits) for name, (_, digits) in columns.items()]
             table += row(f"`{data}`, {kind}", cells)
     return table
 
 
 def score(lines: pd.DataFrame, quantity: str, digits: int) -> str:
-    means = chosen(lines, quantity=quantity)[["value", "low", "high"]].astype(float).mean()
-    return f"{means['value']:.{digits}f} ({means['low']:.{digits}f} to {means['high']:.{digits}f})"
+    """The mean over the lines of a quantity and of its interval; a dash without one."""
+    found = chosen(lines, quantity=quantity)
+    if found.empty:
+        return NOTHING
+    value, low, high = found[["value", "low", "high"]].astype(float).mean()
+    return f"{value:.{digits}f} ({low:.{digits}f} to {high:.{digits}f})"
+
+
+def of_seeds(scores: pd.DataFrame) -> pd.DataFrame:
+    """The scores of runs that differ in their seed alone."""
+    return scores[scores["run"].str.fullmatch(r"seed\d+")]
 
 
 def heads(lines: pd.DataFrame) -> str:
@@ -298,19 +306,12 @@ def tracks(lines: pd.DataFrame) -> str:
     table = heading("sequences", *columns)
     keys = ["data", "cameras", "frames", "model", "run"]
     for (data, cameras, frames, model, run), found in lines.groupby(keys, sort=False):
-        cells = [interval(chosen(found, quantity=name, method=method), n) for name, method, n in columns.values()]
+        found = found.rename(columns={"mean": "value"})
+        cells = [score(chosen(found, method=method), name, n) for name, method, n in columns.values()]
         several = f", {cameras} cameras" if cameras != "1" else ""
         label = f"`{data}`, `{model}`, {run.partition('-')[0]}"
         table += line(label, f"{found['n_sequences'].iloc[0]} × {frames}{several}", *cells)
     return table
-
-
-def interval(lines: pd.DataFrame, digits: int) -> str:
-    """A mean and its interval."""
-    if lines.empty:
-        return NOTHING
-    mean, low, high = lines.iloc[0][["mean", "low", "high"]].astype(float)
-    return f"{mean:.{digits}f} ({low:.{digits}f} to {high:.{digits}f})"
 
 
 def further(lines: pd.DataFrame) -> str:

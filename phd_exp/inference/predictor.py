@@ -148,7 +148,7 @@ class Predictor:
         return View(cut(image, camera), camera, box or whole, size, where)
 
     def see(self, views: View | Sequence[View]) -> Prediction:
-        """Predictions for views, each in the frame of its own virtual camera.
+        """Predictions for views, each in the frame of its virtual camera.
 
         A single view gives a prediction without a batch dimension.
 

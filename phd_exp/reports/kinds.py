@@ -1,4 +1,4 @@
-"""The kinds of tables besides the paper's, as data: headings, groups, columns of CSV, explanations."""
+"""All kinds of tables except the paper's, described as data: headings, groups, columns of CSV, explanations."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -35,7 +35,7 @@ FACTS = (
     *("path", "preset", "data", "model", "run", "digest", "words", "state", "detail", "camera", "images", "command"),
     *("git_commit", "machine", "seed"),
 )
-"""What tables need to know of a run besides its numbers; all texts are printable, `words` are its overrides."""
+"""What tables show of a run with its numbers. All texts are printable; `words` are the overrides."""
 SAME = ("preset", "data", "model", "digest", "words", "subject", "split", "quantity", "method")
 Line = tuple[Any, ...]
 
@@ -106,28 +106,17 @@ def _ends(band: Interval[float]) -> tuple[float, float, float]:
 
 def _of_samples(mean: SampleMean) -> tuple[float, float, float]:
     """A mean with 1.96 standard errors over its samples."""
-    half = math.nan if mean.standard_error is None else 1.959963984540054 * mean.standard_error
+    half = math.nan if mean.standard_error is None else special.ndtri(0.975) * mean.standard_error
     return mean.value, mean.value - half, mean.value + half
 
 
 def facts_of(run: Run) -> tuple[Any, ...]:
     """The `FACTS` of a run."""
     status = run.status
-    texts = (
-        *(
-            run.path,
-            run.preset,
-            run.data,
-            run.model,
-            run.name,
-            run.digest,
-            run.overrides or "",
-            run.state,
-            run.detail,
-        ),
-        *(run.config.get("camera.focal_length", ""), run.measured.images, command_of(run) if status else ""),
-        *((status.git_commit or "", status.machine or "") if status else ("", "")),
-    )
+    made = (command_of(run), status.git_commit or "", status.machine or "") if status else ("", "", "")
+    place = run.path, run.preset, run.data, run.model, run.name, run.digest
+    known = run.overrides or "", run.state, run.detail, run.config.get("camera.focal_length", ""), run.measured.images
+    texts = *place, *known, *made
     return *map(one_line, texts), None if run.seed is None else int(run.seed)
 
 

@@ -1,4 +1,4 @@
-"""The tables of a report besides the paper's: pivots of its numbers."""
+"""All tables of a report except the paper's: pivots of its numbers."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
@@ -191,7 +191,7 @@ def shifts(report: Report) -> Iterator[Table]:
                 part["cell"] = [
                     _in_matrix(is_main, *line) for line in _over(part, "cell", "value", "low", "high")
                 ]  # fmt: skip
-                told = (f"{name}: {change}." for name, change in own.items())
+                described = (f"{name}: {change}." for name, change in own.items())
                 yield KINDS["shifts"].table(
                     "shifts",
                     [key, preset, axis],
@@ -199,7 +199,7 @@ def shifts(report: Report) -> Iterator[Table]:
                     f"{SCORES[key].axis} under shift, {in_words(preset)}: {title}",
                     preset=preset,
                     reading="" if is_main else "details",
-                    notes=(*(KINDS["shifts"].notes if is_main else (OF_THE_DETAILS,)), *told),
+                    notes=(*(KINDS["shifts"].notes if is_main else (OF_THE_DETAILS,)), *described),
                 )
 
 

@@ -1,4 +1,4 @@
-"""Every Projected Huber density of the list, for tests of its own functions."""
+"""The Projected Huber densities of the list, for tests of functions that only they have."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""Each kind of table besides the paper's: its numbers by hand, and what it leaves out."""
+"""Each kind of table except the paper's: its numbers against ones computed by hand, and what it leaves out."""
 
 import shutil
 from collections.abc import Callable
